@@ -1,0 +1,68 @@
+#pragma once
+
+#include <functional>
+#include <optional>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "pipeline/atlas/texture_atlas.h"
+#include "pipeline/hull/visual_hull.h"
+#include "pipeline/segmentation/segmentation.h"
+#include "pipeline/skeleton/skeleton_fit.h"
+#include "pipeline/skin/skinning.h"
+#include "pipeline/surface/decimation.h"
+#include "pipeline/surface/smoothing.h"
+#include "pipeline/types/avatar.h"
+#include "pipeline/types/frame.h"
+#include "pipeline/types/rig.h"
+#include "pipeline/types/work.h"
+
+namespace booth {
+
+/// How the face is made. Automatic: active where there is a projector, else passive.
+enum class FaceMode { automatic, active, passive, none };
+
+std::string_view to_string(FaceMode mode);
+/// "auto", "active", "passive" or "none".
+std::optional<FaceMode> face_mode_from(std::string_view name);
+
+struct ReconstructionOptions {
+  FaceMode face = FaceMode::automatic;
+  SegmentationOptions segmentation;
+  VisualHullOptions hull;
+  SmoothingOptions smoothing;
+  DecimationOptions decimation;
+  AtlasOptions atlas;
+  SkeletonOptions skeleton;
+  SkinningOptions skinning;
+};
+
+/// A capture, decoded.
+struct CaptureFrames {
+  Rig rig;
+  std::vector<FrameSet> background;  ///< the empty booth, one set a repetition
+  FrameSet body;                     ///< the subject, one trigger
+};
+
+
+struct Reconstruction {
+  Avatar avatar;
+  std::vector<std::string> cameras;   ///< ids of those that shaped it
+  std::vector<std::string> warnings;  ///< sentences for an operator
+};
+
+/// The stages in their order; the last ones, "face" included, are named even where a capture skips them.
+const std::vector<std::string>& reconstruction_stages();
+
+/// Called when a stage begins (fraction 0), while it runs, and when it ends (1).
+using StageProgress = std::function<void(std::string_view stage, double fraction)>;
+
+/// The whole method: segment → hull → surface → face → atlas → skeleton → skin.
+///
+/// @param work  its progress is not used; stages report through `progress`
+/// @error what the stages return; invalid_argument for a mode that this version does not offer
+Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options,
+                                   const Work& work = {}, const StageProgress& progress = {});
+
+}  // namespace booth

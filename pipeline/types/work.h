@@ -1,0 +1,38 @@
+#pragma once
+
+#include <cstddef>
+#include <functional>
+#include <stop_token>
+
+#include "pipeline/types/result.h"
+
+namespace booth {
+
+/// How a stage may work: it carries no data. Left out, the stage runs serially, cannot be stopped and tells
+/// nobody how far it is.
+struct Work {
+  using Range = std::function<void(size_t begin, size_t end)>;
+
+  std::stop_token stop;
+  /// Called with the stage's fraction, 0 … 1, never falling, by one thread at a time.
+  std::function<void(double)> progress;
+  /// Runs `body` over [0, count) in pieces, on several threads, and returns when all are done; an exception of
+  /// one piece is thrown again on the caller. Empty: serial. See pipeline/thread_pool.h.
+  std::function<void(size_t count, size_t grain, const Range& body)> parallel;
+
+  /// Splits [0, count) into pieces of at most `grain` and runs them in any order. Pieces may not depend on each
+  /// other; the split depends on count and grain only, never on the number of threads.
+  void parallel_for(size_t count, size_t grain, const Range& body) const {
+    if (count == 0) return;
+    if (parallel) return parallel(count, grain, body);
+    for (size_t begin = 0; begin < count; begin += grain) body(begin, begin + grain < count ? begin + grain : count);
+  }
+  void report(double fraction) const {
+    if (progress) progress(fraction);
+  }
+  bool stopped() const { return stop.stop_requested(); }
+  /// What a stage returns when it notices that it was asked to stop.
+  static Error cancelled() { return {ErrorCode::cancelled, "the work was cancelled"}; }
+};
+
+}  // namespace booth

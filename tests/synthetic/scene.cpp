@@ -1,0 +1,122 @@
+#include "tests/synthetic/scene.h"
+
+#include <cmath>
+#include <memory>
+#include <numbers>
+#include <random>
+#include <string>
+
+#include "pipeline/geometry/camera_model.h"
+
+namespace booth::synthetic {
+namespace {
+
+/// Calls `at(x, y, rays hit, hits)` for every pixel, with a regular pattern of rays in it.
+template <class Visitor>
+void for_each_pixel(const Body& body, const RigCamera& camera, int samples, const Visitor& visit) {
+  const Eigen::Vector3d origin = camera.center();
+  std::vector<Eigen::Vector3d> hits;
+  for (int y = 0; y < camera.intrinsics.height; ++y)
+    for (int x = 0; x < camera.intrinsics.width; ++x) {
+      hits.clear();
+      for (int sy = 0; sy < samples; ++sy)
+        for (int sx = 0; sx < samples; ++sx) {
+          const Eigen::Vector2d pixel(x - 0.5 + (sx + 0.5) / samples, y - 0.5 + (sy + 0.5) / samples);
+          if (Eigen::Vector3d hit; trace(body, origin, world_ray(camera, pixel), &hit)) hits.push_back(hit);
+        }
+      visit(x, y, hits);
+    }
+}
+
+uint8_t to_byte(double share) { return static_cast<uint8_t>(std::lround(255 * std::clamp(share, 0.0, 1.0))); }
+
+}  // namespace
+
+Rig ring_rig(const RigOptions& options) {
+  Rig rig;
+  rig.name = "synthetic-ring";
+  rig.volume = Eigen::AlignedBox3d(Eigen::Vector3d(-0.9, 0, -0.6), Eigen::Vector3d(0.9, 2.2, 0.6));
+  std::mt19937 random(options.seed);
+  std::uniform_real_distribution<double> jitter(-1, 1);
+  for (int i = 0; i < options.cameras; ++i) {
+    RigCamera camera;
+    camera.id = "body-" + std::string(i < 10 ? "0" : "") + std::to_string(i);
+    Intrinsics& k = camera.intrinsics;
+    k.width = options.width;
+    k.height = options.height;
+    k.fx = k.fy = 1.05 * options.height * options.distance_m / 2.6;
+    k.cx = 0.5 * (options.width - 1) + jitter(random);
+    k.cy = 0.5 * (options.height - 1) + jitter(random);
+    if (options.distorted) k.distortion = {-0.05 + 0.01 * jitter(random), 0.008, 0.0004 * jitter(random), 0.0003, 0};
+    const double azimuth = 2 * std::numbers::pi * i / options.cameras;
+    const Eigen::Vector3d center(options.distance_m * std::sin(azimuth), i % 2 == 0 ? 1.0 : 1.8,
+                                 options.distance_m * std::cos(azimuth));
+    const Eigen::Vector3d forward = (Eigen::Vector3d(0, 0.95, 0) - center).normalized();
+    const Eigen::Vector3d right = forward.cross(Eigen::Vector3d::UnitY()).normalized();
+    Eigen::Matrix3d rotation;
+    rotation.row(0) = right;
+    rotation.row(1) = forward.cross(right);
+    rotation.row(2) = forward;
+    camera.camera_from_world.linear() = rotation;
+    camera.camera_from_world.translation() = -rotation * center;
+    rig.cameras.push_back(camera);
+  }
+  return rig;
+}
+
+bool trace(const Body& body, const Eigen::Vector3d& origin, const Eigen::Vector3d& direction, Eigen::Vector3d* hit) {
+  // Skip to the bounding box first: most rays of a picture miss it.
+  const Eigen::AlignedBox3d box = bounds(body);
+  double near = 0, far = 10;
+  for (int axis = 0; axis < 3; ++axis) {
+    const double a = (box.min()[axis] - origin[axis]) / direction[axis];
+    const double b = (box.max()[axis] - origin[axis]) / direction[axis];
+    near = std::max(near, std::min(a, b));
+    far = std::min(far, std::max(a, b));
+  }
+  constexpr double on_surface_m = 2e-5;
+  for (double along = near; along < far;) {
+    const Eigen::Vector3d p = origin + along * direction;
+    const double distance = signed_distance(body, p);
+    if (distance < on_surface_m) {
+      *hit = p;
+      return true;
+    }
+    along += distance;
+  }
+  return false;
+}
+
+Silhouette render_silhouette(const Body& body, const RigCamera& camera, int samples) {
+  Silhouette silhouette{camera.id, Image(camera.intrinsics.width, camera.intrinsics.height, 1)};
+  for_each_pixel(body, camera, samples, [&](int x, int y, const std::vector<Eigen::Vector3d>& hits) {
+    silhouette.coverage.at(x, y) = to_byte(static_cast<double>(hits.size()) / (samples * samples));
+  });
+  return silhouette;
+}
+
+std::vector<Silhouette> render_silhouettes(const Body& body, const Rig& rig, int samples) {
+  std::vector<Silhouette> silhouettes;
+  for (const RigCamera& camera : rig.cameras) silhouettes.push_back(render_silhouette(body, camera, samples));
+  return silhouettes;
+}
+
+Eigen::Vector3d colour_at(const Eigen::Vector3d& p) {
+  return {0.5 + 0.3 * std::sin(5 * p.y()), 0.5 + 0.3 * std::sin(7 * p.x() + 1), 0.5 + 0.3 * std::cos(9 * p.z())};
+}
+
+Frame render_photograph(const Body& body, const RigCamera& camera, int samples) {
+  auto image = std::make_shared<Image>(camera.intrinsics.width, camera.intrinsics.height, 3);
+  const Eigen::Vector3d wall(0.75, 0.76, 0.74);
+  for_each_pixel(body, camera, samples, [&](int x, int y, const std::vector<Eigen::Vector3d>& hits) {
+    Eigen::Vector3d colour = wall * (samples * samples - static_cast<int>(hits.size()));
+    for (const Eigen::Vector3d& hit : hits) colour += colour_at(hit);
+    for (int c = 0; c < 3; ++c) image->at(x, y, c) = to_byte(colour[c] / (samples * samples));
+  });
+  Frame frame;
+  frame.camera = camera.id;
+  frame.pixels = std::move(image);
+  return frame;
+}
+
+}  // namespace booth::synthetic
