@@ -1,2 +1,187 @@
 #include "pipeline/reconstruct.h"
-namespace booth { Result<Reconstruction> reconstruct(const CaptureFrames&, const ReconstructionOptions&, const Work&, const StageProgress&) { return Error{ErrorCode::unsupported, "pending"}; } }
+
+#include <algorithm>
+#include <array>
+#include <optional>
+#include <span>
+#include <utility>
+
+#include "pipeline/surface/marching_cubes.h"
+
+namespace booth {
+namespace {
+
+constexpr std::array<std::pair<FaceMode, std::string_view>, 4> face_mode_names{{{FaceMode::automatic, "auto"},
+                                                                               {FaceMode::active, "active"},
+                                                                               {FaceMode::passive, "passive"},
+                                                                               {FaceMode::none, "none"}}};
+
+/// Tells one stage's progress to the caller's sink, its beginning and its end included.
+class StageReport {
+ public:
+  StageReport(std::string_view stage, const Work& work, const StageProgress& progress)
+      : stage_(stage), progress_(progress), work_(work) {
+    work_.progress = [this](double fraction) { tell(fraction); };
+    tell(0);
+  }
+  ~StageReport() { tell(1); }
+  StageReport(const StageReport&) = delete;
+  StageReport& operator=(const StageReport&) = delete;
+
+  const Work& work() const { return work_; }
+
+ private:
+  void tell(double fraction) const {
+    if (progress_) progress_(stage_, fraction);
+  }
+  std::string_view stage_;
+  const StageProgress& progress_;
+  Work work_;
+};
+
+struct SegmentedViews {
+  std::vector<Silhouette> silhouettes;
+  std::vector<std::string> warnings;
+};
+
+/// The frames of the empty booth that a camera took, in the order of their repetitions.
+std::vector<Frame> background_of(const std::string& camera, std::span<const FrameSet> background) {
+  std::vector<Frame> frames;
+  for (const FrameSet& set : background)
+    for (const Frame& frame : set.frames)
+      if (frame.camera == camera) frames.push_back(frame);
+  return frames;
+}
+
+/// Segments every camera that can be; a camera that cannot is left out and said in the warnings. When nothing is
+/// left, the first camera's reason is the error.
+Result<SegmentedViews> segment_all(const CaptureFrames& capture, const SegmentationOptions& options, const Work& work) {
+  const std::vector<Frame>& frames = capture.body.frames;
+  std::vector<std::optional<Result<Segmentation>>> results(frames.size());
+  const Work inside{.stop = work.stop, .progress = {}, .parallel = work.parallel};
+  work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; ++i)
+      if (!inside.stopped())
+        results[i] = segment(background_of(frames[i].camera, capture.background), frames[i], options, inside);
+  });
+  if (work.stopped()) return Work::cancelled();
+
+  SegmentedViews views;
+  std::optional<Error> first_error;
+  for (size_t i = 0; i < frames.size(); ++i) {
+    Result<Segmentation>& result = *results[i];
+    if (!result) {
+      views.warnings.push_back("camera " + frames[i].camera + " was left out: " + result.error().message);
+      if (!first_error) first_error = result.error();
+      continue;
+    }
+    views.silhouettes.push_back(std::move(result->silhouette));
+    views.warnings.insert(views.warnings.end(), result->warnings.begin(), result->warnings.end());
+  }
+  if (views.silhouettes.empty())
+    return first_error.value_or(Error{ErrorCode::too_few_views, "the capture holds no usable body image"});
+  return views;
+}
+
+Mesh make_surface(const Field& field, const ReconstructionOptions& options, const Work& work) {
+  Mesh mesh = extract_surface(field, work);
+  mesh = smooth_hc(mesh, options.smoothing, work);
+  return decimate(mesh, options.decimation, work);
+}
+
+/// Skeleton and weights, or an avatar left unrigged with a warning: a shape that cannot be rigged is still worth
+/// having.
+Result<void> rig_avatar(Avatar* avatar, const ReconstructionOptions& options, const Work& work,
+                        const StageProgress& progress, std::vector<std::string>* warnings) {
+  const auto unrigged = [&](const Error& error) -> Result<void> {
+    if (error.code == ErrorCode::cancelled) return error;
+    avatar->skeleton = {};
+    avatar->skin = {};
+    warnings->push_back("the avatar is not rigged: " + error.message);
+    return {};
+  };
+  {
+    const StageReport report("skeleton", work, progress);
+    auto fitted = fit_skeleton(avatar->mesh, options.skeleton, report.work());
+    if (!fitted) return unrigged(fitted.error());
+    avatar->skeleton = std::move(fitted->skeleton);
+    warnings->insert(warnings->end(), fitted->warnings.begin(), fitted->warnings.end());
+  }
+  const StageReport report("skin", work, progress);
+  auto skin = compute_skin(avatar->mesh, avatar->skeleton, options.skinning, report.work());
+  if (!skin) return unrigged(skin.error());
+  avatar->skin = std::move(*skin);
+  return {};
+}
+
+}  // namespace
+
+std::string_view to_string(FaceMode mode) {
+  const auto found = std::find_if(face_mode_names.begin(), face_mode_names.end(),
+                                  [&](const auto& entry) { return entry.first == mode; });
+  return found->second;
+}
+
+std::optional<FaceMode> face_mode_from(std::string_view name) {
+  for (const auto& [mode, word] : face_mode_names)
+    if (word == name) return mode;
+  return std::nullopt;
+}
+
+const std::vector<std::string>& reconstruction_stages() {
+  static const std::vector<std::string> stages{"segmentation", "hull", "surface", "atlas", "skeleton", "skin"};
+  return stages;
+}
+
+Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options, const Work& work,
+                                   const StageProgress& progress) {
+  if (const auto checked = check(capture.rig); !checked) return checked.error();
+  Reconstruction result;
+  std::vector<std::string>& warnings = result.warnings;
+
+  SegmentedViews views;
+  {
+    const StageReport report("segmentation", work, progress);
+    auto segmented = segment_all(capture, options.segmentation, report.work());
+    if (!segmented) return segmented.error();
+    views = std::move(*segmented);
+    warnings = std::move(views.warnings);
+  }
+
+  VisualHull hull;
+  {
+    const StageReport report("hull", work, progress);
+    auto carved = carve_visual_hull(capture.rig, views.silhouettes, options.hull, report.work());
+    if (!carved) return carved.error();
+    hull = std::move(*carved);
+    result.cameras = std::move(hull.cameras);
+    warnings.insert(warnings.end(), hull.warnings.begin(), hull.warnings.end());
+  }
+
+  Avatar& avatar = result.avatar;
+  {
+    const StageReport report("surface", work, progress);
+    avatar.mesh = make_surface(hull.field, options, report.work());
+    hull.field = {};
+    if (work.stopped()) return Work::cancelled();
+    if (avatar.mesh.triangles.empty()) return Error{ErrorCode::no_subject, "no surface is left after carving"};
+  }
+
+  if (options.face != FaceMode::none)
+    warnings.push_back("the face is the hull's own: refinement (" + std::string(to_string(options.face)) +
+                       ") is not available in this version");
+
+  {
+    const StageReport report("atlas", work, progress);
+    auto textured = build_texture_atlas(avatar.mesh, capture.rig, capture.body.frames, views.silhouettes,
+                                        options.atlas, report.work());
+    if (!textured) return textured.error();
+    avatar.atlas = std::move(textured->atlas);
+    warnings.insert(warnings.end(), textured->warnings.begin(), textured->warnings.end());
+  }
+
+  if (const auto rigged = rig_avatar(&avatar, options, work, progress, &warnings); !rigged) return rigged.error();
+  return result;
+}
+
+}  // namespace booth

@@ -52,16 +52,19 @@ struct Reconstruction {
   std::vector<std::string> warnings;  ///< sentences for an operator
 };
 
-/// The stages in their order; the last ones, "face" included, are named even where a capture skips them.
+/// The names of the stages in their order.
 const std::vector<std::string>& reconstruction_stages();
 
 /// Called when a stage begins (fraction 0), while it runs, and when it ends (1).
 using StageProgress = std::function<void(std::string_view stage, double fraction)>;
 
-/// The whole method: segment → hull → surface → face → atlas → skeleton → skin.
+/// The whole method: segment → hull → surface → atlas → skeleton → skin.
 ///
 /// @param work  its progress is not used; stages report through `progress`
-/// @error what the stages return; invalid_argument for a mode that this version does not offer
+/// A camera that cannot be used is left out with a warning; a shape that cannot be rigged comes back without joints
+/// and with a warning; a face mode that this version does not offer is a warning.
+///
+/// @error what the stages return, cancelled
 Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options,
                                    const Work& work = {}, const StageProgress& progress = {});
 
