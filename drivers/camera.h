@@ -14,7 +14,7 @@ struct CameraInfo {
   std::string id;      ///< as in the rig
   std::string driver;  ///< "replay", "aravis", "v4l2"
   CameraRole role = CameraRole::body;
-  int width = 0;   ///< of the frames it delivers
+  int width = 0;  ///< of the frames it delivers
   int height = 0;
 };
 

@@ -63,6 +63,10 @@ Result<Recording> read_recording(const std::filesystem::path& folder);
 /// rig.json alone. @error as above
 Result<Rig> read_rig(const std::filesystem::path& file);
 
+/// rig.json's text. read_rig gives every number back bit by bit.
+/// @pre check(rig) holds
+std::string write_rig_json(const Rig& rig);
+
 /// The decoded frames of one shot, by index, and a sentence for each that could not be used.
 struct LoadedShot {
   std::vector<FrameSet> sets;  ///< ascending index

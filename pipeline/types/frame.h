@@ -22,6 +22,8 @@ struct Frame {
   double exposure_us = 0;
   double gain_db = 0;
   std::shared_ptr<const Image> pixels;  ///< grey or RGB; never null in a delivered frame
+  /// The PNG or JPEG that the pixels were decoded from, where the camera delivered one; otherwise null.
+  std::shared_ptr<const std::vector<uint8_t>> encoded = {};
 };
 
 /// The frames of one trigger, at most one per camera. A missing camera is normal data, not an error.

@@ -1,0 +1,189 @@
+#include "replay/recording_writer.h"
+
+#include <fcntl.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cstdio>
+#include <map>
+#include <mutex>
+#include <set>
+#include <system_error>
+#include <tuple>
+#include <utility>
+
+#include "pipeline/image/codec.h"
+#include "replay/durable_folder.h"
+
+namespace booth {
+namespace {
+
+namespace fs = std::filesystem;
+
+Error invalid(const std::string& what) { return {ErrorCode::invalid_argument, what}; }
+
+constexpr size_t largest_image_bytes = size_t{512} << 20;
+
+std::vector<uint8_t> encode(const Image& image, const SpoolOptions& options) {
+  if (options.format == SpoolOptions::Format::jpeg) return encode_jpeg(image, options.jpeg_quality);
+  return encode_png(image, options.png_level);
+}
+
+/// frames/SHOT/CAMERA.png, or with the index where the shot holds a sequence.
+std::string image_file(const ShotHeader& shot, const std::string& camera, int index, ImageFormat format) {
+  std::string file = "frames/" + shot.name + "/" + camera;
+  if (shot.role != ShotRole::body) {
+    char number[16];
+    std::snprintf(number, sizeof number, "-%03d", index);
+    file += number;
+  }
+  return file + (format == ImageFormat::jpeg ? ".jpg" : ".png");
+}
+
+std::string name_of(const std::string& shot, const std::string& camera, int index) {
+  return "frame " + std::to_string(index) + " of " + camera + " in shot " + shot;
+}
+
+}  // namespace
+
+struct RecordingWriter::Content {
+  struct OpenShot {
+    ShotHeader header;
+    std::vector<FrameRecord> frames;
+    std::set<std::pair<std::string, int>> taken;  ///< camera and index
+  };
+
+  Content(DurableFolder folder_, RecordingHeader header_, Rig rig_, SpoolOptions options_)
+      : folder(std::move(folder_)), header(std::move(header_)), rig(std::move(rig_)), options(options_) {}
+
+  /// Registers a frame before it is stored, so that of two equal ones the second is refused.
+  Result<ShotHeader> reserve(const std::string& shot, const std::string& camera, int index) {
+    const std::lock_guard lock(mutex);
+    const auto found =
+        std::find_if(shots.begin(), shots.end(), [&](const OpenShot& s) { return s.header.name == shot; });
+    if (found == shots.end()) return invalid("shot " + shot + " was not begun");
+    if (index < 0 || (index > 0 && found->header.role == ShotRole::body))
+      return invalid(name_of(shot, camera, index) + ": the index is out of range");
+    if (!found->taken.emplace(camera, index).second) return invalid(name_of(shot, camera, index) + " came twice");
+    return found->header;
+  }
+  void record(const std::string& shot, FrameRecord frame) {
+    const std::lock_guard lock(mutex);
+    for (OpenShot& open : shots)
+      if (open.header.name == shot) open.frames.push_back(std::move(frame));
+  }
+
+  DurableFolder folder;
+  const RecordingHeader header;
+  const Rig rig;
+  const SpoolOptions options;
+  std::mutex mutex;
+  std::vector<OpenShot> shots;  ///< guarded by mutex
+};
+
+RecordingWriter::RecordingWriter(std::unique_ptr<Content> content) : content_(std::move(content)) {}
+RecordingWriter::~RecordingWriter() = default;
+
+Result<std::unique_ptr<RecordingWriter>> RecordingWriter::begin(const fs::path& parent, const RecordingHeader& header,
+                                                                const Rig& rig, const SpoolOptions& options) {
+  if (const auto checked = check(rig); !checked) return invalid("the rig cannot be stored: " + checked.error().message);
+  auto folder = DurableFolder::begin(parent, header.id);
+  if (!folder) return folder.error();
+  if (const auto written = folder->write("rig.json", write_rig_json(rig)); !written) return written.error();
+  return std::unique_ptr<RecordingWriter>(
+      new RecordingWriter(std::make_unique<Content>(*std::move(folder), header, rig, options)));
+}
+
+Result<void> RecordingWriter::begin_shot(const ShotHeader& shot) {
+  if (!is_safe_id(shot.name)) return invalid("\"" + shot.name + "\" is not a plain name for a shot");
+  if (shot.role == ShotRole::gray_code && !shot.pattern) return invalid("shot " + shot.name + " needs its pattern");
+  const std::lock_guard lock(content_->mutex);
+  for (const Content::OpenShot& open : content_->shots)
+    if (open.header.name == shot.name) return invalid("shot " + shot.name + " was begun already");
+  content_->shots.push_back({shot, {}, {}});
+  return {};
+}
+
+Result<void> RecordingWriter::add(const std::string& shot, const Frame& frame) {
+  const std::string name = name_of(shot, frame.camera, frame.index);
+  const RigCamera* camera = content_->rig.find(frame.camera);
+  if (camera == nullptr) return invalid(name + ": the rig has no such camera");
+  if (!frame.pixels) return invalid(name + " has no pixels");
+  if (frame.pixels->width != camera->intrinsics.width || frame.pixels->height != camera->intrinsics.height)
+    return invalid(name + " has " + std::to_string(frame.pixels->width) + " × " + std::to_string(frame.pixels->height) +
+                   " pixels, the rig says " + std::to_string(camera->intrinsics.width) + " × " +
+                   std::to_string(camera->intrinsics.height));
+  const auto header = content_->reserve(shot, frame.camera, frame.index);
+  if (!header) return header.error();
+
+  std::vector<uint8_t> encoded;
+  ImageFormat format = content_->options.format == SpoolOptions::Format::jpeg ? ImageFormat::jpeg : ImageFormat::png;
+  std::span<const uint8_t> bytes;
+  if (frame.encoded && content_->options.keep_encoded) {
+    const auto image = read_image_header(*frame.encoded);
+    if (!image) return invalid(name + ": its encoded bytes " + image.error().message);
+    format = image->format;
+    bytes = *frame.encoded;
+  } else {
+    encoded = encode(*frame.pixels, content_->options);
+    bytes = encoded;
+  }
+  FrameRecord record{.camera = frame.camera,
+                     .index = frame.index,
+                     .file = image_file(*header, frame.camera, frame.index, format),
+                     .timestamp_ns = frame.timestamp_ns,
+                     .frame_id = frame.frame_id,
+                     .exposure_us = frame.exposure_us,
+                     .gain_db = frame.gain_db};
+  if (const auto written = content_->folder.write(record.file, bytes); !written) return written;
+  content_->record(shot, std::move(record));
+  return {};
+}
+
+Result<void> RecordingWriter::add_shot(const Recording& from, const Shot& shot) {
+  const ShotHeader header{.name = shot.name, .role = shot.role, .pattern = shot.pattern, .board = shot.board};
+  if (const auto begun = begin_shot(header); !begun) return begun;
+  for (const FrameRecord& frame : shot.frames) {
+    if (content_->rig.find(frame.camera) == nullptr)
+      return invalid(name_of(shot.name, frame.camera, frame.index) + ": the rig has no such camera");
+    if (const auto reserved = content_->reserve(shot.name, frame.camera, frame.index); !reserved)
+      return reserved.error();
+    FrameRecord record = frame;
+    record.file = image_file(header, frame.camera, frame.index,
+                             fs::path(frame.file).extension() == ".png" ? ImageFormat::png : ImageFormat::jpeg);
+    const fs::path source = from.folder / frame.file;
+    const fs::path target = content_->folder.path() / record.file;
+    std::error_code code;
+    fs::create_directories(target.parent_path(), code);
+    if (code || ::linkat(AT_FDCWD, source.c_str(), AT_FDCWD, target.c_str(), 0) != 0) {
+      const auto bytes = read_file(source, largest_image_bytes);
+      if (!bytes) return Error{ErrorCode::invalid_file, bytes.error().message};
+      if (const auto written = content_->folder.write(record.file, *bytes); !written) return written;
+    }
+    content_->record(shot.name, std::move(record));
+  }
+  return {};
+}
+
+Result<void> RecordingWriter::commit() {
+  Recording recording;
+  recording.id = content_->header.id;
+  recording.created = content_->header.created;
+  recording.label = content_->header.label;
+  recording.face = content_->header.face;
+  for (Content::OpenShot& open : content_->shots) {
+    // Frames came in any order; the file names them in one.
+    std::sort(open.frames.begin(), open.frames.end(), [](const FrameRecord& a, const FrameRecord& b) {
+      return std::tie(a.index, a.camera) < std::tie(b.index, b.camera);
+    });
+    recording.shots.push_back(
+        {open.header.name, open.header.role, open.header.pattern, open.header.board, std::move(open.frames)});
+  }
+  if (const auto written = content_->folder.write("recording.json", write_recording_json(recording)); !written)
+    return written;
+  return content_->folder.commit();
+}
+
+const fs::path& RecordingWriter::final_path() const { return content_->folder.final_path(); }
+
+}  // namespace booth
