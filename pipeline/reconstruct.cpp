@@ -12,9 +12,9 @@ namespace booth {
 namespace {
 
 constexpr std::array<std::pair<FaceMode, std::string_view>, 4> face_mode_names{{{FaceMode::automatic, "auto"},
-                                                                               {FaceMode::active, "active"},
-                                                                               {FaceMode::passive, "passive"},
-                                                                               {FaceMode::none, "none"}}};
+                                                                                {FaceMode::active, "active"},
+                                                                                {FaceMode::passive, "passive"},
+                                                                                {FaceMode::none, "none"}}};
 
 /// Tells one stage's progress to the caller's sink, its beginning and its end included.
 class StageReport {
@@ -173,8 +173,8 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
 
   {
     const StageReport report("atlas", work, progress);
-    auto textured = build_texture_atlas(avatar.mesh, capture.rig, capture.body.frames, views.silhouettes,
-                                        options.atlas, report.work());
+    auto textured = build_texture_atlas(avatar.mesh, capture.rig, capture.body.frames, views.silhouettes, options.atlas,
+                                        report.work());
     if (!textured) return textured.error();
     avatar.atlas = std::move(textured->atlas);
     warnings.insert(warnings.end(), textured->warnings.begin(), textured->warnings.end());

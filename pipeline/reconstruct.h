@@ -45,7 +45,6 @@ struct CaptureFrames {
   FrameSet body;                     ///< the subject, one trigger
 };
 
-
 struct Reconstruction {
   Avatar avatar;
   std::vector<std::string> cameras;   ///< ids of those that shaped it

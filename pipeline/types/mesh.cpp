@@ -38,7 +38,8 @@ Result<void> check(const Mesh& mesh) {
   for (size_t t = 0; t < mesh.triangles.size(); ++t) {
     const auto& [a, b, c] = mesh.triangles[t];
     if (std::max({a, b, c}) >= mesh.positions.size())
-      return Error{ErrorCode::invalid_argument, "mesh: triangle " + std::to_string(t) + " names a vertex that is not there"};
+      return Error{ErrorCode::invalid_argument,
+                   "mesh: triangle " + std::to_string(t) + " names a vertex that is not there"};
     if (a == b || b == c || c == a)
       return Error{ErrorCode::invalid_argument, "mesh: triangle " + std::to_string(t) + " repeats a vertex"};
   }

@@ -1,0 +1,178 @@
+// booth-reconstruct: one recording in, one avatar folder out. For batches, tests, benchmarks, and as the child
+// process in which boothd runs a job.
+
+#include <fcntl.h>
+#include <signal.h>
+#include <unistd.h>
+
+#include <CLI/CLI.hpp>
+#include <atomic>
+#include <cstdio>
+#include <iostream>
+#include <nlohmann/json.hpp>
+#include <stop_token>
+#include <string>
+#include <thread>
+
+#include "config/booth_config.h"
+#include "daemon/reconstruct_job.h"
+#include "pipeline/thread_pool.h"
+
+namespace booth {
+namespace {
+
+constexpr int exit_failed = 1;
+constexpr int exit_usage = 2;
+
+/// A bar on a terminal that is drawn over itself.
+class ProgressBar {
+ public:
+  void draw(std::string_view stage, double fraction) {
+    const int percent = static_cast<int>(100 * fraction);
+    if (percent == percent_ && stage == stage_) return;
+    percent_ = percent;
+    stage_ = stage;
+    constexpr int width = 40;
+    const int filled = static_cast<int>(width * fraction);
+    std::string bar;
+    for (int i = 0; i < width; ++i) bar += i < filled ? "█" : "·";
+    std::fprintf(stderr, "\r%s %3d %%  %-14s", bar.c_str(), percent, stage_.c_str());
+    drawn_ = true;
+  }
+  /// Leaves the line to whatever is written next.
+  void clear() {
+    if (drawn_) std::fputs("\r\033[K", stderr);
+    drawn_ = false;
+  }
+
+ private:
+  int percent_ = -1;
+  std::string stage_;
+  bool drawn_ = false;
+};
+
+/// The job's news for the process that started this one: a JSON object a line.
+class ProgressPipe {
+ public:
+  explicit ProgressPipe(int descriptor) : descriptor_(descriptor) {}
+  void tell(const nlohmann::json& news) const {
+    if (descriptor_ < 0) return;
+    const std::string line = news.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace) + "\n";
+    for (size_t sent = 0; sent < line.size();) {
+      const ssize_t count = write(descriptor_, line.data() + sent, line.size() - sent);
+      if (count < 0 && errno == EINTR) continue;
+      if (count <= 0) return;  // the reader is gone; the avatar on disk is what counts
+      sent += static_cast<size_t>(count);
+    }
+  }
+
+ private:
+  int descriptor_;
+};
+
+/// Turns SIGINT and SIGTERM into a stop request, so that a job that is ended leaves no half-made folder.
+class StopOnSignal {
+ public:
+  StopOnSignal() {
+    sigset_t signals;
+    sigemptyset(&signals);
+    for (const int signal : {SIGINT, SIGTERM, SIGUSR1}) sigaddset(&signals, signal);
+    pthread_sigmask(SIG_BLOCK, &signals, nullptr);
+    waiter_ = std::jthread([this, signals] {
+      int signal = 0;
+      sigwait(&signals, &signal);
+      if (signal != SIGUSR1) stop_.request_stop();
+    });
+  }
+  ~StopOnSignal() { pthread_kill(waiter_.native_handle(), SIGUSR1); }
+  StopOnSignal(const StopOnSignal&) = delete;
+  StopOnSignal& operator=(const StopOnSignal&) = delete;
+
+  std::stop_token token() const { return stop_.get_token(); }
+
+ private:
+  std::stop_source stop_;
+  std::jthread waiter_;
+};
+
+struct Arguments {
+  std::string recording, avatar, config, face;
+  bool timings = false;
+  int progress_fd = -1;
+  unsigned threads = 0;
+};
+
+int fail(const ProgressPipe& pipe, const Error& error, int status) {
+  pipe.tell({{"error", {{"kind", to_string(error.code)}, {"message", error.message}}}});
+  std::cerr << "booth-reconstruct: " << error.message << "\n";
+  return status;
+}
+
+int run(const Arguments& arguments) {
+  const ProgressPipe pipe(arguments.progress_fd);
+  BoothConfig config;
+  if (!arguments.config.empty()) {
+    auto loaded = load_config(arguments.config);
+    if (!loaded) return fail(pipe, loaded.error(), exit_usage);
+    config = std::move(*loaded);
+  }
+  ReconstructionOptions options = config.reconstruct;
+  if (!arguments.face.empty()) options.face = *face_mode_from(arguments.face);
+
+  const StopOnSignal stop;
+  ThreadPool pool(arguments.threads);
+  Work work = pool.work();
+  work.stop = stop.token();
+  ProgressBar bar;
+  const bool draw = isatty(STDERR_FILENO) != 0 && arguments.progress_fd < 0;
+  const auto made = reconstruct_recording(arguments.recording, arguments.avatar, options, work,
+                                          [&](std::string_view stage, double fraction) {
+                                            if (draw) bar.draw(stage, fraction);
+                                            pipe.tell({{"stage", stage}, {"fraction", fraction}});
+                                          });
+  bar.clear();
+  if (!made) return fail(pipe, made.error(), exit_failed);
+  for (const std::string& warning : made->warnings) std::cerr << "warning: " << warning << "\n";
+  if (arguments.timings) {
+    nlohmann::ordered_json times;
+    double total = 0;
+    for (const auto& [stage, seconds] : made->stage_seconds) {
+      times[stage] = seconds;
+      total += seconds;
+    }
+    times["total"] = total;
+    std::cout << times.dump() << std::endl;
+  }
+  return 0;
+}
+
+}  // namespace
+}  // namespace booth
+
+int main(int argc, char** argv) {
+  booth::Arguments arguments;
+  CLI::App app("Makes a rigged, textured avatar from a recorded capture.", "booth-reconstruct");
+  app.add_option("RECORDING", arguments.recording, "folder in the recording format")->required();
+  app.add_option("OUT_DIR", arguments.avatar, "where the avatar's folder will appear")->required();
+  app.add_option("--face", arguments.face, "how the face is made")
+      ->check(CLI::IsMember({"active", "passive", "none", "auto"}));
+  app.add_option("--config", arguments.config, "the booth's configuration file");
+  app.add_flag("--timings", arguments.timings, "print the seconds of each stage as JSON");
+  app.add_option("--threads", arguments.threads, "how many to use; 0 for as many as there are processors")
+      ->check(CLI::Range(0, 1024));
+  app.add_option("--progress-fd", arguments.progress_fd,
+                 "write progress as lines of JSON to this open file descriptor");
+  app.set_version_flag("--version", BOOTH_VERSION);
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& e) {
+    const int status = app.exit(e);
+    return status == 0 ? 0 : booth::exit_usage;
+  }
+  try {
+    return booth::run(arguments);
+  } catch (const std::exception& e) {
+    return booth::fail(booth::ProgressPipe(arguments.progress_fd), {booth::ErrorCode::internal, e.what()},
+                       booth::exit_failed);
+  }
+}

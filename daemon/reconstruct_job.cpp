@@ -1,0 +1,171 @@
+#include "daemon/reconstruct_job.h"
+
+#include <algorithm>
+#include <chrono>
+#include <ctime>
+
+#include "pipeline/export/avatar_files.h"
+#include "replay/durable_folder.h"
+#include "replay/recording.h"
+
+namespace booth {
+namespace {
+
+using SteadyClock = std::chrono::steady_clock;
+
+/// Roughly how a job's time falls to its stages, so that the bar moves evenly.
+double share_of(std::string_view stage) {
+  if (stage == "segmentation") return 0.25;
+  if (stage == "hull") return 0.15;
+  if (stage == "surface") return 0.15;
+  if (stage == "atlas") return 0.20;
+  if (stage == "export") return 0.15;
+  return 0.05;
+}
+
+/// Times the stages and turns their fractions into the whole job's.
+class StageClock {
+ public:
+  explicit StageClock(const JobProgress& progress) : progress_(progress) {
+    for (const std::string& stage : job_stages()) total_ += share_of(stage);
+  }
+
+  void tell(std::string_view stage, double fraction) {
+    if (stage != stage_) begin(stage);
+    if (progress_) {
+      const double whole = (done_ + std::clamp(fraction, 0.0, 1.0) * share_of(stage)) / total_;
+      highest_ = std::max(highest_, std::min(whole, 1.0));
+      progress_(stage, highest_);
+    }
+  }
+
+  /// Ends the stage under way and hands out the times.
+  std::vector<std::pair<std::string, double>> finish() {
+    end();
+    return times_;
+  }
+
+ private:
+  void begin(std::string_view stage) {
+    end();
+    stage_ = stage;
+    started_ = SteadyClock::now();
+  }
+  void end() {
+    if (stage_.empty()) return;
+    times_.emplace_back(stage_, std::chrono::duration<double>(SteadyClock::now() - started_).count());
+    done_ += share_of(stage_);
+    stage_.clear();
+  }
+
+  const JobProgress& progress_;
+  double total_ = 0;
+  double done_ = 0;
+  double highest_ = 0;
+  std::string stage_;
+  SteadyClock::time_point started_;
+  std::vector<std::pair<std::string, double>> times_;
+};
+
+/// Whether there is something at `target` that a new avatar replaces: an earlier avatar, and nothing else.
+Result<bool> replaces_earlier(const std::filesystem::path& target) {
+  std::error_code ignored;  // what cannot be looked at cannot be written to either, which commit() will say
+  if (!std::filesystem::exists(target, ignored) || std::filesystem::is_empty(target, ignored)) return false;
+  if (std::filesystem::exists(target / "metadata.json", ignored)) return true;
+  return Error{ErrorCode::invalid_state, target.string() + ": there is something else than an avatar"};
+}
+
+std::string utc_now() {
+  const std::time_t now = std::chrono::system_clock::to_time_t(std::chrono::system_clock::now());
+  std::tm utc{};
+  gmtime_r(&now, &utc);
+  char text[sizeof "2026-11-22T10:15:00Z"];
+  std::strftime(text, sizeof text, "%Y-%m-%dT%H:%M:%SZ", &utc);
+  return text;
+}
+
+void append(std::vector<std::string>* to, const std::vector<std::string>& from) {
+  to->insert(to->end(), from.begin(), from.end());
+}
+
+/// The decoded shots that the reconstruction needs; what could not be used is said in `warnings`.
+Result<CaptureFrames> load_capture(const Recording& recording, const Work& work, std::vector<std::string>* warnings) {
+  const Shot* body = recording.find(ShotRole::body);
+  if (body == nullptr) return Error{ErrorCode::no_subject, "recording.json: shots has none with the role body"};
+  CaptureFrames capture;
+  capture.rig = recording.rig;
+  if (const Shot* background = recording.find(ShotRole::background)) {
+    LoadedShot loaded = load_shot(recording, *background, work);
+    append(warnings, loaded.faults);
+    capture.background = std::move(loaded.sets);
+  } else {
+    return Error{ErrorCode::no_background, "recording.json: shots has none with the role background"};
+  }
+  LoadedShot loaded = load_shot(recording, *body, work);
+  append(warnings, loaded.faults);
+  if (loaded.sets.empty()) {
+    const std::string reason = loaded.faults.empty() ? "the body shot has no frames" : loaded.faults.front();
+    return Error{ErrorCode::too_few_views, "no image of the body shot can be used: " + reason};
+  }
+  capture.body = std::move(loaded.sets.front());
+  return capture;
+}
+
+}  // namespace
+
+const std::vector<std::string>& job_stages() {
+  static const std::vector<std::string> stages = [] {
+    std::vector<std::string> names{"load"};
+    append(&names, reconstruction_stages());
+    names.emplace_back("export");
+    return names;
+  }();
+  return stages;
+}
+
+Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_folder,
+                                        const std::filesystem::path& avatar, const ReconstructionOptions& options,
+                                        const Work& work, const JobProgress& progress) {
+  // A trailing slash names the same folder.
+  const std::filesystem::path target = avatar.has_filename() ? avatar : avatar.parent_path();
+  const std::filesystem::path parent = target.has_parent_path() ? target.parent_path() : ".";
+  const auto replaces = replaces_earlier(target);
+  if (!replaces) return replaces.error();
+  auto folder = DurableFolder::begin(parent, target.filename().string());
+  if (!folder) return folder.error();
+
+  StageClock clock(progress);
+  clock.tell("load", 0);
+  const auto recording = read_recording(recording_folder);
+  if (!recording) return recording.error();
+  JobReport report;
+  auto capture = load_capture(*recording, work, &report.warnings);
+  if (!capture) return capture.error();
+
+  const auto stage_progress = [&](std::string_view stage, double fraction) { clock.tell(stage, fraction); };
+  auto made = reconstruct(*capture, options, work, stage_progress);
+  if (!made) return made.error();
+  append(&report.warnings, made->warnings);
+  *capture = {};  // the export needs the memory more than anybody needs the images
+
+  AvatarMetadata metadata;
+  metadata.id = target.filename().string();
+  metadata.created = utc_now();
+  metadata.label = recording->label;
+  metadata.recording = recording->id;
+  metadata.cameras = std::move(made->cameras);
+  metadata.warnings = report.warnings;
+  metadata.stage_seconds = clock.finish();
+  clock.tell("export", 0);
+  for (const NamedBytes& file : make_avatar_files(made->avatar, std::move(metadata), {}, work))
+    if (const auto written = folder->write(file.name, file.bytes); !written) return written.error();
+  if (work.stopped()) return Work::cancelled();
+  if (*replaces)
+    if (const auto removed = remove_folder(parent, target.filename().string()); !removed) return removed.error();
+  if (const auto committed = folder->commit(); !committed) return committed.error();
+  clock.tell("export", 1);
+  report.stage_seconds = clock.finish();
+  return report;
+}
+
+}  // namespace booth

@@ -1,0 +1,40 @@
+#pragma once
+
+#include <filesystem>
+#include <functional>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include "pipeline/reconstruct.h"
+#include "pipeline/types/work.h"
+
+namespace booth {
+
+/// The stages of a job in their order: "load", those of reconstruct(), "export".
+const std::vector<std::string>& job_stages();
+
+/// Called with the stage under way and the fraction of the whole job, 0 … 1, never falling.
+using JobProgress = std::function<void(std::string_view stage, double fraction)>;
+
+struct JobReport {
+  std::vector<std::pair<std::string, double>> stage_seconds;  ///< in the order the stages ran
+  std::vector<std::string> warnings;                          ///< as in the metadata
+};
+
+/// From a recording on disk to an avatar folder on disk. The folder appears whole or not at all; its name is the
+/// avatar's id. An earlier avatar there is replaced. Frames that cannot be used are warnings in its metadata as long as
+/// enough are left.
+///
+/// @param recording  a folder in the recording format
+/// @param avatar     where the avatar's folder will appear; its parent is made where it is missing
+/// @param work       its progress is not used
+/// @error what read_recording and reconstruct return; no_background and no_subject for a recording without these
+///        shots; invalid_argument when `avatar` is no plain name; invalid_state when something else is there; io,
+///        disk_full
+Result<JobReport> reconstruct_recording(const std::filesystem::path& recording, const std::filesystem::path& avatar,
+                                        const ReconstructionOptions& options, const Work& work,
+                                        const JobProgress& progress = {});
+
+}  // namespace booth

@@ -1,0 +1,190 @@
+#include "daemon/reconstruct_job.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <filesystem>
+#include <fstream>
+#include <random>
+#include <set>
+
+#include "pipeline/export/metadata.h"
+#include "pipeline/thread_pool.h"
+#include "replay/durable_folder.h"
+
+namespace booth {
+namespace {
+
+namespace fs = std::filesystem;
+
+const fs::path mini = fs::path(BOOTH_SOURCE_DIR) / "replay/recordings/mini";
+
+/// Coarse, so that a hundred reconstructions take seconds.
+ReconstructionOptions coarse() {
+  ReconstructionOptions options;
+  options.hull.voxel_m = 0.02;
+  options.decimation.triangles = 1000;
+  options.atlas.size = 256;
+  return options;
+}
+
+class ReconstructJob : public testing::Test {
+ protected:
+  ReconstructJob() {
+    fs::create_directories(folder_);
+    fs::copy(mini, folder_ / "recording", fs::copy_options::recursive);
+    fs::remove_all(folder_ / "recording/truth");
+  }
+  ~ReconstructJob() override { fs::remove_all(folder_); }
+
+  Result<JobReport> run(const ReconstructionOptions& options = coarse(), const Work& extra = {}) {
+    Work work = pool_.work();
+    work.stop = extra.stop;
+    return reconstruct_recording(
+        folder_ / "recording", folder_ / "out/avatar", options, work,
+        [this](std::string_view stage, double fraction) { news_.emplace_back(stage, fraction); });
+  }
+  bool nothing_is_left() const { return !fs::exists(folder_ / "out") || fs::is_empty(folder_ / "out"); }
+
+  fs::path folder_ = fs::temp_directory_path() / ("reconstruct-job-" + std::to_string(getpid()));
+  ThreadPool pool_;
+  std::vector<std::pair<std::string, double>> news_;
+};
+
+std::string text_of(const fs::path& file) {
+  std::ifstream stream(file, std::ios::binary);
+  return {std::istreambuf_iterator<char>(stream), {}};
+}
+
+TEST_F(ReconstructJob, PublishesACompleteAvatar) {
+  const auto report = run();
+  ASSERT_TRUE(report.ok()) << report.error().message;
+  const fs::path avatar = folder_ / "out/avatar";
+  for (const char* file : {"avatar.dae", "texture.png", "avatar.glb", "preview.png", "metadata.json"})
+    EXPECT_TRUE(fs::is_regular_file(avatar / file)) << file;
+  const auto metadata = read_metadata(text_of(avatar / "metadata.json"));
+  ASSERT_TRUE(metadata.ok()) << metadata.error().message;
+  EXPECT_EQ(metadata->id, "avatar");
+  EXPECT_EQ(metadata->recording, "2026-11-22T09-55-00Z-cd7c");
+  EXPECT_EQ(metadata->cameras.size(), 8U);
+  EXPECT_EQ(metadata->joints, 23U);
+  EXPECT_LE(metadata->triangles, 1000U);
+  EXPECT_EQ(metadata->warnings, report->warnings);
+  std::vector<std::string> stages;
+  for (const auto& [stage, seconds] : report->stage_seconds) stages.push_back(stage);
+  EXPECT_EQ(stages, job_stages());
+}
+
+TEST_F(ReconstructJob, TellsProgressThatNeverFallsAndEndsAtOne) {
+  ASSERT_TRUE(run().ok());
+  ASSERT_FALSE(news_.empty());
+  for (size_t i = 1; i < news_.size(); ++i) EXPECT_GE(news_[i].second, news_[i - 1].second) << news_[i].first;
+  EXPECT_DOUBLE_EQ(news_.back().second, 1);
+  std::set<std::string> stages;
+  for (const auto& [stage, fraction] : news_) stages.insert(stage);
+  EXPECT_EQ(stages, std::set<std::string>(job_stages().begin(), job_stages().end()));
+}
+
+TEST_F(ReconstructJob, GivesTheSameFilesAgain) {
+  ASSERT_TRUE(run().ok());
+  const std::string first = text_of(folder_ / "out/avatar/avatar.glb");
+  fs::remove_all(folder_ / "out");
+  ASSERT_TRUE(run().ok());
+  EXPECT_TRUE(first == text_of(folder_ / "out/avatar/avatar.glb"));
+}
+
+TEST_F(ReconstructJob, CancelledLeavesNothing) {
+  std::stop_source stop;
+  stop.request_stop();
+  const auto report = run(coarse(), {.stop = stop.get_token(), .progress = {}, .parallel = {}});
+  ASSERT_FALSE(report.ok());
+  EXPECT_EQ(report.error().code, ErrorCode::cancelled);
+  EXPECT_TRUE(nothing_is_left());
+}
+
+TEST_F(ReconstructJob, RefusesAFolderThatHoldsSomethingElse) {
+  fs::create_directories(folder_ / "out/avatar");
+  std::ofstream(folder_ / "out/avatar/diary.txt") << "dear diary";
+  const auto report = run();
+  ASSERT_FALSE(report.ok());
+  EXPECT_EQ(report.error().code, ErrorCode::invalid_state);
+  EXPECT_EQ(text_of(folder_ / "out/avatar/diary.txt"), "dear diary");
+}
+
+TEST_F(ReconstructJob, ReplacesAnEarlierAvatar) {
+  ASSERT_TRUE(run().ok());
+  fs::remove(folder_ / "out/avatar/preview.png");
+  const auto again = run();
+  ASSERT_TRUE(again.ok()) << again.error().message;
+  EXPECT_TRUE(fs::exists(folder_ / "out/avatar/preview.png"));
+}
+
+TEST_F(ReconstructJob, SaysWhichShotIsMissing) {
+  for (const auto& [role, code] :
+       {std::pair{"\"body\",", ErrorCode::no_subject}, std::pair{"\"background\",", ErrorCode::no_background}}) {
+    std::string text = text_of(mini / "recording.json");
+    const std::string key = std::string("\"role\": ") + role;
+    const size_t at = text.find(key);
+    ASSERT_NE(at, std::string::npos);
+    text.replace(at, key.size(), "\"role\": \"portrait\",");
+    std::ofstream(folder_ / "recording/recording.json") << text;
+    const auto report = run();
+    ASSERT_FALSE(report.ok());
+    EXPECT_EQ(report.error().code, code) << report.error().message;
+    EXPECT_TRUE(nothing_is_left());
+  }
+}
+
+/// What befalls a file: its bytes before and after.
+struct Damage {
+  const char* name;
+  std::function<void(const fs::path&)> inflict;
+};
+
+void rewrite(const fs::path& file, const std::string& bytes) { std::ofstream(file, std::ios::binary) << bytes; }
+
+TEST_F(ReconstructJob, AnyDamagedFileGivesOneClearErrorOrAnAvatarWithAWarning) {
+  const std::vector<Damage> damages{
+      {"deleted", [](const fs::path& file) { fs::remove(file); }},
+      {"emptied", [](const fs::path& file) { rewrite(file, ""); }},
+      {"truncated", [](const fs::path& file) { rewrite(file, text_of(file).substr(0, fs::file_size(file) / 2)); }},
+      {"scrambled",
+       [](const fs::path& file) {
+         std::string bytes = text_of(file);
+         std::mt19937 random(5);
+         for (size_t i = 0; i < bytes.size(); i += 1 + random() % 64) bytes[i] = static_cast<char>(random());
+         rewrite(file, bytes);
+       }},
+  };
+  const fs::path recording = folder_ / "recording";
+  std::vector<fs::path> files;
+  for (const auto& entry : fs::recursive_directory_iterator(recording))
+    if (entry.is_regular_file()) files.push_back(entry.path());
+  ASSERT_EQ(files.size(), 18U);
+  std::sort(files.begin(), files.end());
+
+  for (const fs::path& file : files) {
+    const std::string original = text_of(file);
+    for (const Damage& damage : damages) {
+      SCOPED_TRACE(file.filename().string() + " " + damage.name);
+      damage.inflict(file);
+      const auto report = run();
+      if (report) {
+        const bool told = std::any_of(report->warnings.begin(), report->warnings.end(), [&](const std::string& w) {
+          return w.find(file.stem().string().substr(0, 7)) != std::string::npos;
+        });
+        EXPECT_TRUE(told) << "no warning names the file";
+        EXPECT_TRUE(fs::exists(folder_ / "out/avatar/avatar.dae"));
+      } else {
+        EXPECT_FALSE(report.error().message.empty());
+        EXPECT_EQ(report.error().message.find('\n'), std::string::npos) << report.error().message;
+        EXPECT_TRUE(nothing_is_left());
+      }
+      fs::remove_all(folder_ / "out");
+      rewrite(file, original);
+    }
+  }
+}
+
+}  // namespace
+}  // namespace booth
