@@ -17,7 +17,7 @@ namespace booth {
 /// the outer corner of the bottom-right one: the centre of texel (i, j) is ((i + 0.5) / width, (j + 0.5) / height).
 /// Formats that count v upwards get it flipped by their exporter.
 struct Atlas {
-  Image image;  ///< 3 channels, sRGB
+  Image image;                                     ///< 3 channels, sRGB
   std::vector<std::array<Eigen::Vector2f, 3>> uv;  ///< one entry a triangle, in the order of its corners
 };
 

@@ -27,7 +27,7 @@ struct MeshTopology {
   size_t nonmanifold_vertices = 0;   ///< vertices whose triangles form more than one fan
   size_t unreferenced_vertices = 0;  ///< vertices without a triangle
   size_t components = 0;
-  long euler_number = 0;  ///< V − E + F
+  long euler_number = 0;        ///< V − E + F
   double signed_volume_m3 = 0;  ///< positive when triangles face outwards
 
   bool closed_manifold() const {

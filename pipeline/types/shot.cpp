@@ -21,8 +21,7 @@ std::string_view to_string(ShotRole role) {
 }
 
 std::optional<ShotRole> shot_role_from(std::string_view name) {
-  for (const ShotRole role :
-       {ShotRole::background, ShotRole::body, ShotRole::gray_code, ShotRole::calibration_board})
+  for (const ShotRole role : {ShotRole::background, ShotRole::body, ShotRole::gray_code, ShotRole::calibration_board})
     if (name == to_string(role)) return role;
   return std::nullopt;
 }

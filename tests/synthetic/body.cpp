@@ -114,8 +114,8 @@ Field sample_field(const Body& body, double voxel_m) {
         for (int k = 0; k < side; ++k)
           for (int j = 0; j < side; ++j)
             for (int i = 0; i < side; ++i)
-              *sample++ = static_cast<float>(
-                  signed_distance(body, grid.point(bx * side + i, by * side + j, bz * side + k)));
+              *sample++ =
+                  static_cast<float>(signed_distance(body, grid.point(bx * side + i, by * side + j, bz * side + k)));
       }
   return field;
 }
