@@ -6,15 +6,20 @@
 
 namespace booth {
 
+/// All text is UTF-8.
 struct ColladaOptions {
-  std::string texture_file = "texture.png";  ///< relative path of the atlas
-  std::string created = "1970-01-01T00:00:00Z";
+  std::string texture_file = "texture.png";      ///< relative path of the atlas
+  std::string created = "1970-01-01T00:00:00Z";  ///< ISO 8601
   std::string authoring_tool = "Avatar Booth";
 };
 
-/// The avatar as a COLLADA 1.4.1 document, as the avatar's contract says: metres, Y up, one geometry, one
-/// material, one skin, the joint tree. An avatar without joints is written as a plain geometry instance.
+/// The avatar as a COLLADA 1.4.1 document, valid by its schema: metres, Y up, one geometry of triangles with normals
+/// and uvs (v upwards, as COLLADA has it), one matt material with the texture, one skin with weights that sum to
+/// exactly 1 as printed, the joint tree at rest with sids equal to the joints' names. A joint's name that is no XML
+/// name, or one of the document's own ids, is altered until it fits. An avatar without joints is written as a plain
+/// geometry instance.
 /// @pre check(avatar) holds
+/// Source: The Khronos Group, "COLLADA – Digital Asset Schema Release 1.4.1", 2nd edition, 2008.
 std::string write_collada(const Avatar& avatar, const ColladaOptions& options);
 
 }  // namespace booth

@@ -1,2 +1,205 @@
 #include "pipeline/export/gltf.h"
-namespace booth { std::vector<uint8_t> write_glb(const Avatar&, std::span<const uint8_t>, const GltfOptions&) { return {}; } }
+
+#include <Eigen/Geometry>
+#include <cstring>
+#include <limits>
+#include <nlohmann/json.hpp>
+
+#include "pipeline/export/seam_vertices.h"
+#include "pipeline/export/skin_tables.h"
+
+namespace booth {
+namespace {
+
+using Json = nlohmann::ordered_json;
+
+// Numbers of the specification.
+constexpr int byte_type = 5121, short_type = 5123, int_type = 5125, float_type = 5126;  // unsigned, but for float
+constexpr int vertex_target = 34962, index_target = 34963;
+constexpr int linear_filter = 9729, linear_mipmap_filter = 9987, clamp_to_edge = 33071;
+constexpr size_t alignment = 4;
+
+/// The document and its one buffer while they grow together. Chunks and accessors begin at multiples of four bytes.
+class Document {
+ public:
+  Json json;
+
+  /// Appends bytes as a new buffer view; `target` 0 for data that is not for vertices.
+  size_t add_view(std::span<const uint8_t> bytes, int target) {
+    buffer_.resize((buffer_.size() + alignment - 1) / alignment * alignment, 0);
+    Json view = {{"buffer", 0}, {"byteOffset", buffer_.size()}, {"byteLength", bytes.size()}};
+    if (target != 0) view["target"] = target;
+    buffer_.insert(buffer_.end(), bytes.begin(), bytes.end());
+    return append("bufferViews", std::move(view));
+  }
+
+  /// Appends an array of items of the kind `type` ("VEC3") with components of `component_type`.
+  template <class Item>
+  size_t add_accessor(const std::vector<Item>& items, int component_type, const char* type, int target) {
+    const std::span<const uint8_t> bytes(reinterpret_cast<const uint8_t*>(items.data()), items.size() * sizeof(Item));
+    const size_t view = add_view(bytes, target);
+    return append("accessors",
+                  {{"bufferView", view}, {"componentType", component_type}, {"count", items.size()}, {"type", type}});
+  }
+
+  /// Appends to an array of the document's root and returns the new item's index.
+  size_t append(const char* array, Json item) {
+    json[array].push_back(std::move(item));
+    return json[array].size() - 1;
+  }
+
+  /// Header, JSON chunk, binary chunk. Little-endian, as the processors are that this is built for.
+  std::vector<uint8_t> to_glb() {
+    buffer_.resize((buffer_.size() + alignment - 1) / alignment * alignment, 0);
+    json["buffers"] = Json::array({{{"byteLength", buffer_.size()}}});
+    std::string text = json.dump(-1, ' ', false, Json::error_handler_t::replace);
+    text.resize((text.size() + alignment - 1) / alignment * alignment, ' ');
+    constexpr uint32_t magic = 0x46546C67, version = 2, json_chunk = 0x4E4F534A, binary_chunk = 0x004E4942;
+    constexpr size_t header_bytes = 12, chunk_header_bytes = 8;
+    const size_t length = header_bytes + chunk_header_bytes + text.size() + chunk_header_bytes + buffer_.size();
+    std::vector<uint8_t> glb;
+    glb.reserve(length);
+    const auto put = [&](uint32_t word) {
+      for (int shift = 0; shift < 32; shift += 8) glb.push_back(static_cast<uint8_t>(word >> shift));
+    };
+    put(magic), put(version), put(static_cast<uint32_t>(length));
+    put(static_cast<uint32_t>(text.size())), put(json_chunk);
+    glb.insert(glb.end(), text.begin(), text.end());
+    put(static_cast<uint32_t>(buffer_.size())), put(binary_chunk);
+    glb.insert(glb.end(), buffer_.begin(), buffer_.end());
+    return glb;
+  }
+
+ private:
+  std::vector<uint8_t> buffer_;
+};
+
+/// The values of `per_vertex` for every copy of a mesh vertex.
+template <class Item>
+std::vector<Item> spread(const std::vector<Item>& per_vertex, const SeamVertices& split) {
+  std::vector<Item> items;
+  items.reserve(split.mesh_vertex.size());
+  for (const uint32_t vertex : split.mesh_vertex) items.push_back(per_vertex[vertex]);
+  return items;
+}
+
+Json to_json(const Eigen::Vector3f& v) { return {v.x(), v.y(), v.z()}; }
+
+size_t add_positions(Document& document, const Mesh& mesh, const SeamVertices& split) {
+  const std::vector<Eigen::Vector3f> positions = spread(mesh.positions, split);
+  Eigen::AlignedBox3f box;
+  for (const Eigen::Vector3f& p : positions) box.extend(p);
+  const size_t accessor = document.add_accessor(positions, float_type, "VEC3", vertex_target);
+  document.json["accessors"][accessor]["min"] = to_json(box.min());
+  document.json["accessors"][accessor]["max"] = to_json(box.max());
+  return accessor;
+}
+
+template <class Index>
+size_t add_indices_as(Document& document, const SeamVertices& split, int component_type) {
+  std::vector<Index> indices;
+  indices.reserve(split.triangles.size() * 3);
+  for (const auto& triangle : split.triangles)
+    for (const uint32_t vertex : triangle) indices.push_back(static_cast<Index>(vertex));
+  return document.add_accessor(indices, component_type, "SCALAR", index_target);
+}
+
+/// The smallest type that holds the indices; its largest number is not an index, by the specification.
+size_t add_indices(Document& document, const SeamVertices& split) {
+  return split.mesh_vertex.size() <= std::numeric_limits<uint16_t>::max()
+             ? add_indices_as<uint16_t>(document, split, short_type)
+             : add_indices_as<uint32_t>(document, split, int_type);
+}
+
+template <class Index>
+size_t add_joints_as(Document& document, const SkinTables& tables, const SeamVertices& split, int component_type) {
+  std::vector<std::array<Index, 4>> joints;
+  joints.reserve(split.mesh_vertex.size());
+  for (const uint32_t vertex : split.mesh_vertex) {
+    auto& entry = joints.emplace_back();
+    for (size_t k = 0; k < 4; ++k) entry[k] = static_cast<Index>(tables.influences[vertex].joint[k]);
+  }
+  return document.add_accessor(joints, component_type, "VEC4", vertex_target);
+}
+
+size_t add_weights(Document& document, const SkinTables& tables, const SeamVertices& split) {
+  std::vector<std::array<float, 4>> weights;
+  weights.reserve(split.mesh_vertex.size());
+  for (const uint32_t vertex : split.mesh_vertex) {
+    auto& entry = weights.emplace_back();
+    for (size_t k = 0; k < 4; ++k)
+      entry[k] =
+          static_cast<float>(static_cast<double>(tables.influences[vertex].weight[k]) / WholeInfluences::weight_unit);
+  }
+  return document.add_accessor(weights, float_type, "VEC4", vertex_target);
+}
+
+/// The material: matt, in the colours of the texture.
+size_t add_material(Document& document, std::span<const uint8_t> texture_png) {
+  const size_t view = document.add_view(texture_png, 0);
+  const size_t image = document.append("images", {{"name", "atlas"}, {"bufferView", view}, {"mimeType", "image/png"}});
+  const size_t sampler = document.append("samplers", {{"magFilter", linear_filter},
+                                                      {"minFilter", linear_mipmap_filter},
+                                                      {"wrapS", clamp_to_edge},
+                                                      {"wrapT", clamp_to_edge}});
+  const size_t texture = document.append("textures", {{"sampler", sampler}, {"source", image}});
+  const Json surface = {{"baseColorTexture", {{"index", texture}}}, {"metallicFactor", 0.0}, {"roughnessFactor", 1.0}};
+  return document.append("materials", {{"name", "avatar"}, {"pbrMetallicRoughness", surface}});
+}
+
+/// A node for every joint, moved and turned so that each can be animated. Returns the node of joint 0.
+size_t add_joint_nodes(Document& document, const Skeleton& skeleton) {
+  const size_t first = document.json["nodes"].size();
+  for (const Joint& joint : skeleton.joints) {
+    const Eigen::Vector3f t = joint.parent_from_joint.translation().cast<float>();
+    const Eigen::Quaternionf q = Eigen::Quaterniond(joint.parent_from_joint.linear()).normalized().cast<float>();
+    const size_t node = document.append(
+        "nodes", {{"name", joint.name}, {"translation", to_json(t)}, {"rotation", {q.x(), q.y(), q.z(), q.w()}}});
+    if (joint.parent >= 0)
+      document.json["nodes"][first + static_cast<size_t>(joint.parent)]["children"].push_back(node);
+  }
+  return first;
+}
+
+size_t add_skin(Document& document, const SkinTables& tables, size_t first_joint) {
+  std::vector<Eigen::Matrix4f> matrices = tables.joint_from_world;  // column by column, as glTF and Eigen have them
+  const size_t accessor = document.add_accessor(matrices, float_type, "MAT4", 0);
+  Json joints = Json::array();
+  for (size_t j = 0; j < matrices.size(); ++j) joints.push_back(first_joint + j);
+  return document.append("skins", {{"inverseBindMatrices", accessor}, {"skeleton", first_joint}, {"joints", joints}});
+}
+
+}  // namespace
+
+std::vector<uint8_t> write_glb(const Avatar& avatar, std::span<const uint8_t> texture_png, const GltfOptions& options) {
+  const SeamVertices split = split_at_seams(avatar);
+  Document document;
+  document.json["asset"] = {{"version", "2.0"}, {"generator", options.generator}};
+  document.json["scene"] = 0;
+
+  Json attributes = {
+      {"POSITION", add_positions(document, avatar.mesh, split)},
+      {"NORMAL", document.add_accessor(spread(unit_normals(avatar.mesh), split), float_type, "VEC3", vertex_target)},
+      {"TEXCOORD_0", document.add_accessor(split.uv, float_type, "VEC2", vertex_target)}};
+  Json body = {{"name", "avatar"}, {"mesh", 0}};
+  Json roots = Json::array();
+  if (const size_t joints = avatar.skeleton.joints.size(); joints > 0) {
+    const SkinTables tables = make_skin_tables(avatar);
+    attributes["JOINTS_0"] = joints <= size_t{std::numeric_limits<uint8_t>::max()} + 1
+                                 ? add_joints_as<uint8_t>(document, tables, split, byte_type)
+                                 : add_joints_as<uint16_t>(document, tables, split, short_type);
+    attributes["WEIGHTS_0"] = add_weights(document, tables, split);
+    const size_t root = add_joint_nodes(document, avatar.skeleton);
+    roots.push_back(root);
+    body["skin"] = add_skin(document, tables, root);
+  }
+  const Json primitive = {{"attributes", attributes},
+                          {"indices", add_indices(document, split)},
+                          {"material", add_material(document, texture_png)}};
+  document.append("meshes", {{"name", "avatar"}, {"primitives", Json::array({primitive})}});
+  roots.push_back(document.append("nodes", body));
+  document.append("scenes", {{"nodes", roots}});
+  return document.to_glb();
+}
+
+}  // namespace booth

@@ -10,12 +10,14 @@
 namespace booth {
 
 struct GltfOptions {
-  std::string generator = "Avatar Booth";
+  std::string generator = "Avatar Booth";  ///< UTF-8
 };
 
-/// The avatar as a self-contained glTF 2.0 binary (GLB).
+/// The avatar as a self-contained glTF 2.0 binary (GLB): metres, Y up, facing +Z as glTF wants it. Vertices are split
+/// where the atlas has seams; the joints, their bind pose and the weights are the same as in write_collada.
 /// @param texture_png  the atlas, encoded; embedded as it is
 /// @pre check(avatar) holds
+/// Source: The Khronos Group, "glTF 2.0 Specification", version 2.0.1, 2021 (ISO/IEC 12113:2022).
 std::vector<uint8_t> write_glb(const Avatar& avatar, std::span<const uint8_t> texture_png, const GltfOptions& options);
 
 }  // namespace booth
