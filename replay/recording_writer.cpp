@@ -1,11 +1,9 @@
 #include "replay/recording_writer.h"
 
-#include <fcntl.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cstdio>
-#include <map>
 #include <mutex>
 #include <set>
 #include <system_error>
@@ -14,6 +12,7 @@
 
 #include "pipeline/image/codec.h"
 #include "replay/durable_folder.h"
+#include "replay/recording_file.h"
 
 namespace booth {
 namespace {
@@ -38,6 +37,19 @@ std::string image_file(const ShotHeader& shot, const std::string& camera, int in
     file += number;
   }
   return file + (format == ImageFormat::jpeg ? ".jpg" : ".png");
+}
+
+/// Links a file of another recording into a folder, or copies it where that cannot be.
+Result<void> take_over(const Recording& from, const std::string& source, DurableFolder& folder,
+                       const std::string& target) {
+  const auto path = resolve_recording_file(from.folder, source);
+  if (!path) return Error{ErrorCode::invalid_file, from.id + ": " + path.error().message};
+  std::error_code code;
+  fs::create_directories((folder.path() / target).parent_path(), code);
+  if (!code && ::link(path->c_str(), (folder.path() / target).c_str()) == 0) return {};
+  const auto bytes = read_recording_file(from.folder, source, largest_image_bytes);
+  if (!bytes) return Error{ErrorCode::invalid_file, from.id + ": " + bytes.error().message};
+  return folder.write(target, *bytes);
 }
 
 std::string name_of(const std::string& shot, const std::string& camera, int index) {
@@ -151,15 +163,7 @@ Result<void> RecordingWriter::add_shot(const Recording& from, const Shot& shot) 
     FrameRecord record = frame;
     record.file = image_file(header, frame.camera, frame.index,
                              fs::path(frame.file).extension() == ".png" ? ImageFormat::png : ImageFormat::jpeg);
-    const fs::path source = from.folder / frame.file;
-    const fs::path target = content_->folder.path() / record.file;
-    std::error_code code;
-    fs::create_directories(target.parent_path(), code);
-    if (code || ::linkat(AT_FDCWD, source.c_str(), AT_FDCWD, target.c_str(), 0) != 0) {
-      const auto bytes = read_file(source, largest_image_bytes);
-      if (!bytes) return Error{ErrorCode::invalid_file, bytes.error().message};
-      if (const auto written = content_->folder.write(record.file, *bytes); !written) return written;
-    }
+    if (const auto taken = take_over(from, frame.file, content_->folder, record.file); !taken) return taken;
     content_->record(shot.name, std::move(record));
   }
   return {};

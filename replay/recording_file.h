@@ -1,0 +1,33 @@
+#pragma once
+
+#include <cstdint>
+#include <filesystem>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "pipeline/types/image.h"
+#include "pipeline/types/result.h"
+#include "pipeline/types/rig.h"
+#include "replay/recording.h"
+
+namespace booth {
+
+/// Where one file of a recording is, with every symbolic link followed. Messages begin with the file as the
+/// recording names it. @error not_found; @error invalid_file  it leads out of the folder; @error io
+Result<std::filesystem::path> resolve_recording_file(const std::filesystem::path& folder, const std::string& file);
+
+/// The bytes of one file of a recording. Messages begin with the file as the recording names it.
+/// @error as resolve_recording_file; @error invalid_file  larger than `most_bytes`, or not a regular file
+Result<std::vector<uint8_t>> read_recording_file(const std::filesystem::path& folder, const std::string& file,
+                                                 size_t most_bytes);
+
+/// Decodes a camera's PNG or JPEG to grey or RGB; transparency is dropped. An image that is not the size of its
+/// camera is refused before its pixels are decoded. @error invalid_file
+Result<Image> decode_frame(std::span<const uint8_t> bytes, const Intrinsics& expected);
+
+/// Reads and decodes one frame; it carries its encoded bytes.
+/// @error not_found, io; invalid_file  damaged or wrongly sized; the message begins with the file's name
+Result<Frame> load_frame(const Recording& recording, const FrameRecord& record);
+
+}  // namespace booth
