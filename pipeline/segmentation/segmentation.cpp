@@ -1,2 +1,137 @@
 #include "pipeline/segmentation/segmentation.h"
-namespace booth { Result<Segmentation> segment(std::span<const Frame>, const Frame&, const SegmentationOptions&, const Work&) { return Error{ErrorCode::unsupported, "pending"}; } }
+
+#include <cmath>
+#include <sstream>
+
+#include "pipeline/segmentation/background_model.h"
+#include "pipeline/segmentation/labeling.h"
+#include "pipeline/segmentation/matting.h"
+
+namespace booth {
+namespace {
+
+using segmentation::BackgroundModel;
+using segmentation::Labeling;
+using segmentation::Residual;
+
+// When an operator should have a look.
+constexpr double much_border = 0.5;        ///< share of the image's border that the subject touches
+constexpr double much_drift = 1.4;         ///< factor in linear light between the captures
+constexpr double little_agreement = 0.25;  ///< share of the image that still looks like the background
+constexpr double little_contrast = 0.3;    ///< see Labeling::contrast
+
+Result<void> check(const SegmentationOptions& options) {
+  const auto in = [](double value, double low, double high) { return value >= low && value <= high; };
+  std::ostringstream message;
+  if (!in(options.darkest_shadow, 0.05, 0.95)) {
+    message << "segmentation.darkest_shadow: " << options.darkest_shadow << ", expected 0.05 … 0.95";
+  } else if (!in(options.smoothness, 0, 20)) {
+    message << "segmentation.smoothness: " << options.smoothness << ", expected 0 … 20";
+  } else if (!in(options.smallest_part, 0, 1)) {
+    message << "segmentation.smallest_part: " << options.smallest_part << ", expected 0 … 1";
+  } else if (!in(options.smallest_subject, 0, 1)) {
+    message << "segmentation.smallest_subject: " << options.smallest_subject << ", expected 0 … 1";
+  } else {
+    return {};
+  }
+  return Error{ErrorCode::invalid_argument, message.str()};
+}
+
+std::string describe(const Image& image) {
+  std::ostringstream text;
+  text << image.width << " × " << image.height << " with " << image.channels << " channel(s)";
+  return text.str();
+}
+
+bool holds_its_samples(const Image& image) {
+  return image.width > 0 && image.height > 0 && (image.channels == 1 || image.channels == 3) &&
+         image.samples.size() ==
+             static_cast<size_t>(image.width) * static_cast<size_t>(image.height) * static_cast<size_t>(image.channels);
+}
+
+Result<void> check(std::span<const Frame> background, const Frame& body) {
+  if (!body.pixels || !holds_its_samples(*body.pixels)) {
+    return Error{ErrorCode::invalid_argument, "camera " + body.camera + ": the body frame is no grey or RGB image"};
+  }
+  if (background.empty()) return Error{ErrorCode::no_background, "camera " + body.camera + ": no background frame"};
+  for (const Frame& frame : background) {
+    if (!frame.pixels)
+      return Error{ErrorCode::no_background, "camera " + body.camera + ": a background frame is empty"};
+    if (frame.pixels->width != body.pixels->width || frame.pixels->height != body.pixels->height ||
+        frame.pixels->channels != body.pixels->channels || !holds_its_samples(*frame.pixels)) {
+      return Error{ErrorCode::no_background, "camera " + body.camera + ": a background frame is " +
+                                                 describe(*frame.pixels) + ", the body frame " +
+                                                 describe(*body.pixels)};
+    }
+  }
+  return {};
+}
+
+/// Share of the image's border pixels that are subject.
+double border_share(const Image& coverage) {
+  size_t covered = 0;
+  for (int x = 0; x < coverage.width; ++x) {
+    covered += coverage.at(x, 0) >= 128;
+    covered += coverage.at(x, coverage.height - 1) >= 128;
+  }
+  for (int y = 0; y < coverage.height; ++y) {
+    covered += coverage.at(0, y) >= 128;
+    covered += coverage.at(coverage.width - 1, y) >= 128;
+  }
+  return static_cast<double>(covered) / (2.0 * (coverage.width + coverage.height));
+}
+
+std::vector<std::string> find_warnings(const Residual& residual, const Labeling& labeling, const Segmentation& result,
+                                       const std::string& camera) {
+  std::vector<std::string> warnings;
+  const auto warn = [&](const std::string& what) { warnings.push_back("camera " + camera + ": " + what); };
+  double drift = 1;
+  for (int c = 0; c < residual.difference.channels; ++c) {
+    const double factor = std::exp(segmentation::srgb_exponent * std::abs(residual.mean_drift[c]));
+    drift = std::max(drift, factor);
+  }
+  if (drift > much_drift) {
+    std::ostringstream text;
+    text.precision(2);
+    text << "the light changed by a factor of " << drift << " since the background was captured";
+    warn(text.str());
+  }
+  if (residual.drift_support < little_agreement) warn("little of the image still looks like the background");
+  if (labeling.contrast < little_contrast) warn("the subject hardly differs from the background");
+  if (border_share(result.silhouette.coverage) > much_border)
+    warn("the subject reaches over most of the image's border");
+  return warnings;
+}
+
+}  // namespace
+
+Result<Segmentation> segment(std::span<const Frame> background, const Frame& body, const SegmentationOptions& options,
+                             const Work& work) {
+  if (Result<void> ok = check(options); !ok) return ok.error();
+  if (Result<void> ok = check(background, body); !ok) return ok.error();
+
+  const BackgroundModel model = segmentation::learn_background(background);
+  const Residual residual = segmentation::compare(model, segmentation::average_cells(*body.pixels, model.grid));
+  if (work.stopped()) return Work::cancelled();
+  work.report(0.5);
+
+  const Labeling labeling = segmentation::label_cells(model.grid, residual,
+                                                      {.darkest_shadow = options.darkest_shadow,
+                                                       .smoothness = options.smoothness,
+                                                       .smallest_part = options.smallest_part});
+  Segmentation result;
+  result.subject_share = static_cast<double>(labeling.subject_cells) / static_cast<double>(model.grid.count());
+  if (labeling.subject_cells == 0 || result.subject_share < options.smallest_subject) {
+    return Error{ErrorCode::no_subject, "camera " + body.camera + ": nobody stands before the background"};
+  }
+  if (work.stopped()) return Work::cancelled();
+  work.report(0.8);
+
+  result.silhouette.camera = body.camera;
+  result.silhouette.coverage = segmentation::matte(background, *body.pixels, model.grid, residual, labeling.subject);
+  result.warnings = find_warnings(residual, labeling, result, body.camera);
+  work.report(1);
+  return result;
+}
+
+}  // namespace booth

@@ -5,24 +5,48 @@
 #include <vector>
 
 #include "pipeline/types/frame.h"
+#include "pipeline/types/result.h"
 #include "pipeline/types/silhouette.h"
 #include "pipeline/types/work.h"
 
 namespace booth {
 
-struct SegmentationOptions {};
+struct SegmentationOptions {
+  /// Share of the light that the deepest soft shadow on floor and walls leaves, 0.05 … 0.95. Lower where a single
+  /// lamp casts heavy shadows, higher where dark clothes get lost.
+  double darkest_shadow = 0.25;
+  /// How strongly the outline avoids places without an edge, 0 … 20. Higher removes more ragged pieces, lower keeps
+  /// more fine ones.
+  double smoothness = 3;
+  /// Parts smaller than this share of the largest are dropped as specks, 0 … 1.
+  double smallest_part = 0.02;
+  /// Least share of the image that counts as somebody being there, 0 … 1.
+  double smallest_subject = 0.002;
+};
 
 struct Segmentation {
   Silhouette silhouette;
-  double subject_share = 0;            ///< of the image's area
-  std::vector<std::string> warnings;   ///< what an operator should know, naming the camera
+  double subject_share = 0;           ///< of the image's area, 0 … 1
+  std::vector<std::string> warnings;  ///< what an operator should know, naming the camera
 };
 
 /// Separates the subject from the background that the same camera saw in the empty booth.
 ///
-/// @param background  one or more frames of the empty booth, same camera and size as `body`
-/// @error no_background     `background` is empty or of another size
+/// A model of the empty booth with its noise; drift of light, gain and white balance found from what still looks
+/// like it; shadows told from things by keeping the background's chromaticity and by fading in; a minimum cut for
+/// what is ambiguous; then the share that the subject covers of each pixel along the outline, in linear light.
+///
+/// @param background  one or more frames of the empty booth, same camera, size and channels as `body`
+/// @param body        8-bit grey or RGB (sRGB), distorted pixels as captured; the subject may be cut by the border
+/// @return a coverage of the frame's size, in its pixels: 255 subject, 0 background, its 127.5 level the outline
+/// @error no_background     `background` is empty, or a frame of it is missing or of another size or channel count
 /// @error no_subject        nothing in the frame differs from the background
+/// @error invalid_argument  an option outside its range, or a body frame that is empty or neither grey nor RGB
+/// @error cancelled         asked to stop
+/// Cost: O(pixels × frames), about 20 bytes a pixel. One call is serial: run the cameras side by side.
+/// Source: J. Sun et al., "Background Cut", ECCV 2006; T. Horprasert et al. 1999 for shadows; for the outline the
+/// compositing equation I = α F + (1 − α) B with B known, R. J. Qian, M. I. Sezan, "Video background replacement
+/// without a blue screen", ICIP 1999.
 Result<Segmentation> segment(std::span<const Frame> background, const Frame& body, const SegmentationOptions& options,
                              const Work& work = {});
 

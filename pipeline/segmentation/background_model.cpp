@@ -1,0 +1,370 @@
+#include "pipeline/segmentation/background_model.h"
+
+#include <cmath>
+#include <cstdint>
+
+#include "pipeline/segmentation/smoothing.h"
+
+namespace booth::segmentation {
+namespace {
+
+/// Cells the grid should have about: fine enough for fingers, coarse enough to be quick.
+constexpr double target_cells = 400000;
+/// Beyond this many pixels a cell would swallow fingers, however large the sensor is.
+constexpr int max_step = 4;
+
+/// Sums over the pixels of each cell of one cell row, channel by channel interleaved; pixels beyond the image
+/// repeat its last ones.
+void sum_cell_row(const Image& image, const CellGrid& grid, int cell_y, std::vector<uint32_t>& column_sums,
+                  std::vector<uint32_t>& cell_sums) {
+  const size_t row_samples = static_cast<size_t>(image.width) * static_cast<size_t>(image.channels);
+  column_sums.assign(row_samples, 0);
+  for (int dy = 0; dy < grid.step; ++dy) {
+    const uint8_t* row = image.pixel(0, std::min(cell_y * grid.step + dy, image.height - 1));
+    for (size_t i = 0; i < row_samples; ++i) column_sums[i] += row[i];
+  }
+  const int channels = image.channels;
+  for (int x = 0; x < grid.width; ++x) {
+    for (int c = 0; c < channels; ++c) {
+      uint32_t sum = 0;
+      for (int dx = 0; dx < grid.step; ++dx) {
+        sum += column_sums[static_cast<size_t>(std::min(x * grid.step + dx, image.width - 1) * channels + c)];
+      }
+      cell_sums[static_cast<size_t>(x * channels + c)] = sum;
+    }
+  }
+}
+
+CellPlanes make_planes(int channels, size_t count, float fill = 0) {
+  CellPlanes planes;
+  planes.channels = channels;
+  for (int c = 0; c < channels; ++c) planes.values[c].assign(count, fill);
+  return planes;
+}
+
+/// log(sum / weight + srgb_offset) for every sum that a cell can have.
+std::vector<float> lightness_table(size_t weight) {
+  std::vector<float> table(weight * 255 + 1);
+  for (size_t i = 0; i < table.size(); ++i) {
+    table[i] = std::log(static_cast<float>(i) / static_cast<float>(weight) + srgb_offset);
+  }
+  return table;
+}
+
+// ---- drift ----------------------------------------------------------------------------------------------------
+
+/// Differences are sought for drift within ± this: a factor of 10 in linear light.
+constexpr float drift_range = 1.0F;
+constexpr int drift_bins = 400;
+/// Light and gain seldom change more than this between two captures of a session; it settles ties between the
+/// background and a large uniform shirt.
+constexpr float expected_drift = 0.15F;
+/// How far a background cell's difference may lie from the common drift: slow variation over the image, darker or
+/// lighter by shadow and bounced light, and in chromaticity.
+constexpr float drift_slack = 0.08F;
+constexpr float drift_chroma_slack = 0.025F;
+/// Cells along the edge of a block that gets one estimate of the drift.
+constexpr int drift_block = 16;
+/// Over how many blocks the drift is smoothed: shadows are to stay visible as such.
+constexpr float drift_smoothing_blocks = 4.0F;
+
+/// The most common difference, sought in a histogram and refined by the mean around it.
+float common_difference(const std::vector<float>& difference) {
+  std::array<float, drift_bins> histogram{};
+  constexpr float bin = 2 * drift_range / drift_bins;
+  for (const float d : difference) {
+    const int i = static_cast<int>((d + drift_range) / bin);
+    if (d > -drift_range && i < drift_bins) histogram[i] += 1;
+  }
+  int best = drift_bins / 2;
+  float best_count = 0;
+  for (int i = 2; i + 2 < drift_bins; ++i) {
+    const float count =
+        histogram[i - 2] + 2 * histogram[i - 1] + 3 * histogram[i] + 2 * histogram[i + 1] + histogram[i + 2];
+    const float at = (static_cast<float>(i) + 0.5F) * bin - drift_range;
+    const float weighted = count * std::exp(-0.5F * at * at / (expected_drift * expected_drift));
+    if (weighted > best_count) {
+      best_count = weighted;
+      best = i;
+    }
+  }
+  const float mode = (static_cast<float>(best) + 0.5F) * bin - drift_range;
+  double sum = 0;
+  size_t count = 0;
+  for (const float d : difference) {
+    if (std::abs(d - mode) > 3 * bin) continue;
+    sum += d;
+    ++count;
+  }
+  return count > 0 ? static_cast<float>(sum / static_cast<double>(count)) : 0;
+}
+
+bool agrees_with(const CellPlanes& difference, const std::array<float, 3>& drift, size_t cell) {
+  float deviation[3];
+  for (int c = 0; c < difference.channels; ++c) {
+    deviation[c] = difference.values[c][cell] - drift[c];
+    if (std::abs(deviation[c]) > drift_slack) return false;
+  }
+  if (difference.channels == 1) return true;
+  return std::abs(deviation[0] - deviation[1]) < drift_chroma_slack &&
+         std::abs(deviation[2] - deviation[1]) < drift_chroma_slack;
+}
+
+/// Per block the mean deviation from the common drift of the cells that agree with it, smoothed over the image.
+/// Where few agree, the neighbourhood's drift carries over.
+CellPlanes slow_drift(const CellPlanes& difference, const std::array<float, 3>& common, const CellGrid& grid,
+                      int* blocks_x, int* blocks_y, double* support) {
+  const int nx = (grid.width + drift_block - 1) / drift_block;
+  const int ny = (grid.height + drift_block - 1) / drift_block;
+  CellPlanes sums = make_planes(difference.channels, static_cast<size_t>(nx) * static_cast<size_t>(ny));
+  std::vector<float> weight(sums.values[0].size(), 0);
+  size_t agreeing = 0;
+  for (int y = 0; y < grid.height; ++y) {
+    for (int x = 0; x < grid.width; ++x) {
+      const size_t cell = grid.index(x, y);
+      if (!agrees_with(difference, common, cell)) continue;
+      const size_t block =
+          static_cast<size_t>(y / drift_block) * static_cast<size_t>(nx) + static_cast<size_t>(x / drift_block);
+      for (int c = 0; c < difference.channels; ++c) sums.values[c][block] += difference.values[c][cell] - common[c];
+      weight[block] += 1;
+      ++agreeing;
+    }
+  }
+  *support = static_cast<double>(agreeing) / static_cast<double>(grid.count());
+  gaussian_blur(weight, nx, ny, drift_smoothing_blocks);
+  // A trace of the common drift keeps the quotient defined where no block of the neighbourhood agrees.
+  const float trace = 0.01F * drift_block * drift_block;
+  for (int c = 0; c < difference.channels; ++c) {
+    gaussian_blur(sums.values[c], nx, ny, drift_smoothing_blocks);
+    for (size_t i = 0; i < weight.size(); ++i) sums.values[c][i] = common[c] + sums.values[c][i] / (weight[i] + trace);
+  }
+  *blocks_x = nx;
+  *blocks_y = ny;
+  return sums;
+}
+
+/// Block values at every cell, linear between the blocks' centres.
+void expand_blocks(const std::vector<float>& blocks, int nx, int ny, const CellGrid& grid, std::vector<float>& out) {
+  out.resize(grid.count());
+  const auto place = [](int cell, int blocks_along, int* first, float* fraction) {
+    const float at = (static_cast<float>(cell) + 0.5F) / drift_block - 0.5F;
+    *first = std::clamp(static_cast<int>(std::floor(at)), 0, std::max(0, blocks_along - 2));
+    *fraction = blocks_along < 2 ? 0 : std::clamp(at - static_cast<float>(*first), 0.0F, 1.0F);
+  };
+  std::vector<float> row(static_cast<size_t>(nx));
+  for (int y = 0; y < grid.height; ++y) {
+    int by = 0;
+    float fy = 0;
+    place(y, ny, &by, &fy);
+    const float* upper = blocks.data() + static_cast<size_t>(by) * static_cast<size_t>(nx);
+    const float* lower = ny < 2 ? upper : upper + nx;
+    for (int x = 0; x < nx; ++x) row[x] = upper[x] + fy * (lower[x] - upper[x]);
+    for (int x = 0; x < grid.width; ++x) {
+      int bx = 0;
+      float fx = 0;
+      place(x, nx, &bx, &fx);
+      const float left = row[bx];
+      const float right = nx < 2 ? left : row[bx + 1];
+      out[grid.index(x, y)] = left + fx * (right - left);
+    }
+  }
+}
+
+// ---- noise ----------------------------------------------------------------------------------------------------
+
+constexpr int noise_block = 8;
+constexpr int noise_bins = 16;
+/// A bin with fewer blocks says nothing.
+constexpr size_t min_blocks = 12;
+/// The share of quiet blocks that is taken for background even when the subject fills most of the image.
+constexpr double quiet_share = 0.3;
+/// Standard deviation in levels of the least noise that eight bits can show after averaging.
+constexpr float least_noise = 0.35F;
+/// How far, in pixels, the image may have moved between the captures beyond what nobody notices.
+constexpr float vibration_px = 0.15F;
+
+/// Noise variance in level² at 16 brightnesses, of one channel. Blocks of 8 × 8 cells compare what they scatter
+/// about their own mean; the quieter ones of a brightness are the background's.
+std::array<float, noise_bins> noise_curve(const std::vector<float>& difference, const std::vector<float>& level,
+                                          const CellGrid& grid) {
+  std::array<std::vector<float>, noise_bins> variances;
+  for (int y0 = 0; y0 + noise_block <= grid.height; y0 += noise_block) {
+    for (int x0 = 0; x0 + noise_block <= grid.width; x0 += noise_block) {
+      float sum = 0, squares = 0, levels = 0;
+      for (int y = y0; y < y0 + noise_block; ++y) {
+        for (int x = x0; x < x0 + noise_block; ++x) {
+          const size_t i = grid.index(x, y);
+          sum += difference[i];
+          squares += difference[i] * difference[i];
+          levels += level[i];
+        }
+      }
+      constexpr float n = noise_block * noise_block;
+      const float scale = levels / n + srgb_offset;
+      const float variance = std::max(0.0F, squares - sum * sum / n) / (n - 1) * scale * scale;
+      variances[static_cast<size_t>(std::clamp(levels / n / 256 * noise_bins, 0.0F, noise_bins - 1.0F))].push_back(
+          variance);
+    }
+  }
+  std::array<float, noise_bins> curve{};
+  std::array<bool, noise_bins> known{};
+  for (int b = 0; b < noise_bins; ++b) {
+    std::vector<float>& v = variances[b];
+    if (v.size() < min_blocks) continue;
+    const auto quantile = v.begin() + static_cast<long>(quiet_share * static_cast<double>(v.size()));
+    std::nth_element(v.begin(), quantile, v.end());
+    curve[b] = *quantile;
+    known[b] = true;
+  }
+  for (int b = 0; b < noise_bins; ++b) {
+    if (known[b]) continue;
+    for (int reach = 1; reach < noise_bins; ++reach) {
+      const bool below = b - reach >= 0 && known[b - reach];
+      const bool above = b + reach < noise_bins && known[b + reach];
+      if (!below && !above) continue;
+      curve[b] = std::max(below ? curve[b - reach] : 0.0F, above ? curve[b + reach] : 0.0F);
+      break;
+    }
+  }
+  for (float& v : curve) v = std::max(v, least_noise * least_noise);
+  return curve;
+}
+
+/// The larger of the steps to the left and right, or up and down, squared and added.
+float squared_gradient(const std::vector<float>& values, const CellGrid& grid, int x, int y) {
+  const float here = values[grid.index(x, y)];
+  const float left = values[grid.index(std::max(x - 1, 0), y)] - here;
+  const float right = values[grid.index(std::min(x + 1, grid.width - 1), y)] - here;
+  const float up = values[grid.index(x, std::max(y - 1, 0))] - here;
+  const float down = values[grid.index(x, std::min(y + 1, grid.height - 1))] - here;
+  return std::max(left * left, right * right) + std::max(up * up, down * down);
+}
+
+}  // namespace
+
+CellGrid make_grid(int image_width, int image_height) {
+  const double pixels = static_cast<double>(image_width) * image_height;
+  CellGrid grid;
+  grid.step = std::clamp(static_cast<int>(std::lround(std::sqrt(pixels / target_cells))), 1, max_step);
+  grid.width = (image_width + grid.step - 1) / grid.step;
+  grid.height = (image_height + grid.step - 1) / grid.step;
+  return grid;
+}
+
+CellFrame average_cells(const Image& image, const CellGrid& grid) {
+  const size_t weight = static_cast<size_t>(grid.step) * static_cast<size_t>(grid.step);
+  const std::vector<float> table = lightness_table(weight);
+  CellFrame frame;
+  frame.lightness = make_planes(image.channels, grid.count());
+  frame.level = make_planes(image.channels, grid.count());
+  std::vector<uint32_t> columns, cells(static_cast<size_t>(grid.width) * static_cast<size_t>(image.channels));
+  for (int y = 0; y < grid.height; ++y) {
+    sum_cell_row(image, grid, y, columns, cells);
+    for (int c = 0; c < image.channels; ++c) {
+      float* lightness = frame.lightness.values[c].data() + grid.index(0, y);
+      float* level = frame.level.values[c].data() + grid.index(0, y);
+      for (int x = 0; x < grid.width; ++x) {
+        const uint32_t sum = cells[static_cast<size_t>(x * image.channels + c)];
+        lightness[x] = table[sum];
+        level[x] = static_cast<float>(sum) / static_cast<float>(weight);
+      }
+    }
+  }
+  return frame;
+}
+
+BackgroundModel learn_background(std::span<const Frame> frames) {
+  const Image& first = *frames[0].pixels;
+  BackgroundModel model;
+  model.grid = make_grid(first.width, first.height);
+  model.frames = static_cast<int>(frames.size());
+  if (frames.size() == 1) {
+    CellFrame only = average_cells(first, model.grid);
+    model.lightness = std::move(only.lightness);
+    model.level = std::move(only.level);
+    return model;
+  }
+  const CellGrid& grid = model.grid;
+  const int channels = first.channels;
+  const size_t cell_pixels = static_cast<size_t>(grid.step) * static_cast<size_t>(grid.step);
+  const std::vector<float> table = lightness_table(cell_pixels * frames.size());
+  model.lightness = make_planes(channels, grid.count());
+  model.level = make_planes(channels, grid.count());
+  model.flicker.assign(grid.count(), 0);
+  const size_t row_values = static_cast<size_t>(grid.width) * static_cast<size_t>(channels);
+  std::vector<uint32_t> columns, cells(row_values), total(row_values);
+  std::vector<float> squares(row_values);
+  const auto n = static_cast<float>(frames.size());
+  const float per_cell = 1.0F / static_cast<float>(cell_pixels);
+  for (int y = 0; y < grid.height; ++y) {
+    std::fill(total.begin(), total.end(), 0U);
+    std::fill(squares.begin(), squares.end(), 0.0F);
+    for (const Frame& frame : frames) {
+      sum_cell_row(*frame.pixels, grid, y, columns, cells);
+      for (size_t i = 0; i < row_values; ++i) {
+        total[i] += cells[i];
+        const float v = static_cast<float>(cells[i]) * per_cell;
+        squares[i] += v * v;
+      }
+    }
+    float* flicker = model.flicker.data() + grid.index(0, y);
+    for (int c = 0; c < channels; ++c) {
+      float* lightness = model.lightness.values[c].data() + grid.index(0, y);
+      float* level = model.level.values[c].data() + grid.index(0, y);
+      for (int x = 0; x < grid.width; ++x) {
+        const size_t i = static_cast<size_t>(x * channels + c);
+        lightness[x] = table[total[i]];
+        level[x] = static_cast<float>(total[i]) * per_cell / n;
+        flicker[x] += std::max(0.0F, squares[i] - n * level[x] * level[x]) / (n - 1) / static_cast<float>(channels);
+      }
+    }
+  }
+  box_mean_3x3(model.flicker, grid.width, grid.height);
+  return model;
+}
+
+Residual compare(const BackgroundModel& background, const CellFrame& body) {
+  const CellGrid& grid = background.grid;
+  const int channels = background.lightness.channels;
+  Residual residual;
+  residual.body = body.lightness;
+  residual.difference = make_planes(channels, grid.count());
+  residual.variance = make_planes(channels, grid.count());
+  residual.drift.channels = channels;
+  for (int c = 0; c < channels; ++c) {
+    const std::vector<float>& empty = background.lightness.values[c];
+    const std::vector<float>& seen = body.lightness.values[c];
+    std::vector<float>& difference = residual.difference.values[c];
+    for (size_t i = 0; i < difference.size(); ++i) difference[i] = seen[i] - empty[i];
+    residual.mean_drift[c] = common_difference(difference);
+  }
+  int blocks_x = 0, blocks_y = 0;
+  const CellPlanes blocks =
+      slow_drift(residual.difference, residual.mean_drift, grid, &blocks_x, &blocks_y, &residual.drift_support);
+  for (int c = 0; c < channels; ++c) {
+    std::vector<float>& difference = residual.difference.values[c];
+    std::vector<float>& drift = residual.drift.values[c];
+    expand_blocks(blocks.values[c], blocks_x, blocks_y, grid, drift);
+    for (size_t i = 0; i < difference.size(); ++i) difference[i] -= drift[i];
+
+    const std::vector<float>& level = background.level.values[c];
+    const auto curve = noise_curve(difference, level, grid);
+    const float shift = vibration_px / static_cast<float>(grid.step);
+    // The scatter of the curve holds the body frame's noise and that of the background's mean; between the
+    // background's frames there is only their own, so it adds what is special about a cell.
+    for (int y = 0; y < grid.height; ++y) {
+      for (int x = 0; x < grid.width; ++x) {
+        const size_t i = grid.index(x, y);
+        const float darker = std::min(level[i], body.level.values[c][i]);
+        float noise = curve[static_cast<size_t>(level[i] / 256 * noise_bins)];
+        if (!background.flicker.empty()) noise = std::max(noise, background.flicker[i]);
+        const float scale = darker + srgb_offset;
+        residual.variance.values[c][i] =
+            noise / (scale * scale) + shift * shift * squared_gradient(background.lightness.values[c], grid, x, y);
+      }
+    }
+  }
+  return residual;
+}
+
+}  // namespace booth::segmentation

@@ -1,0 +1,276 @@
+#include "pipeline/segmentation/labeling.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <numeric>
+
+#include "pipeline/segmentation/components.h"
+#include "pipeline/segmentation/minimum_cut.h"
+
+namespace booth::segmentation {
+namespace {
+
+// Evidence is in nats: the logarithm of how much likelier one explanation is than the other.
+
+/// What a perfectly ordinary background cell says for background, and the most that a cell can say for subject:
+/// no single cell may outvote its whole neighbourhood.
+constexpr float background_evidence = 4;
+constexpr float largest_evidence = 12;
+/// What a cell says that is darker than the background by what a soft shadow could take: next to nothing. Its
+/// boundary decides: shadows fade in, things have edges.
+constexpr float shadow_evidence = 0.05F;
+/// Bounced light tints the background by this much (lightness differences between channels), shadows by more.
+constexpr float tint = 0.02F;
+constexpr float tint_in_shadow = 0.08F;
+/// Bounced light brightens by this much at most, as a standard deviation.
+constexpr float brightening = 0.025F;
+/// A loss of lightness up to this is not even noticed.
+constexpr float unnoticed_shadow = 0.03F;
+
+/// Differences of lightness between neighbours beyond noise that count as an edge.
+constexpr float edge_lightness = 0.04F;
+
+/// Integer capacities per nat.
+constexpr float capacity_scale = 256;
+
+/// Evidence for subject (positive) or background (negative) of one cell.
+class Evidence {
+ public:
+  Evidence(const Residual& residual, const LabelingOptions& options)
+      : residual_(residual),
+        deepest_(-std::log(static_cast<float>(options.darkest_shadow)) / srgb_exponent),
+        colored_(residual.difference.channels == 3) {}
+
+  float operator()(size_t i) const {
+    const auto& d = residual_.difference.values;
+    const auto& v = residual_.variance.values;
+    float lightness = d[0][i];
+    float variance = v[0][i];
+    float unlikeness = 0;
+    if (colored_) {
+      lightness = (d[0][i] + d[1][i] + d[2][i]) / 3;
+      variance = (v[0][i] + v[1][i] + v[2][i]) / 9;
+      const float shadow = tint_in_shadow * std::clamp(-lightness, 0.0F, deepest_);
+      const float slack = tint * tint + shadow * shadow;
+      const float red = d[0][i] - d[1][i];
+      const float blue = d[2][i] - d[1][i];
+      unlikeness = 0.5F * (red * red / (v[0][i] + v[1][i] + slack) + blue * blue / (v[2][i] + v[1][i] + slack));
+    }
+    return std::min(unlikeness + of_lightness(lightness, variance), largest_evidence);
+  }
+
+ private:
+  float of_lightness(float lightness, float variance) const {
+    if (lightness > 0) {
+      return 0.5F * lightness * lightness / (variance + brightening * brightening) - background_evidence;
+    }
+    const float noticed = std::max(0.0F, -lightness - unnoticed_shadow);
+    const float spread = variance + 0.25F * unnoticed_shadow * unnoticed_shadow;
+    const float rising = std::min(0.5F * noticed * noticed / spread - background_evidence, shadow_evidence);
+    // Beyond the deepest shadow the evidence rises again, as fast as it fell short of it.
+    const float beyond = std::max(0.0F, -lightness / deepest_ - 1);
+    return rising + background_evidence * beyond / 0.5F;
+  }
+
+  const Residual& residual_;
+  float deepest_;
+  bool colored_;
+};
+
+/// What it costs to draw a boundary between two neighbouring cells.
+class BoundaryCost {
+ public:
+  BoundaryCost(const Residual& residual, double smoothness)
+      : residual_(residual), smoothness_(static_cast<float>(smoothness) * capacity_scale) {}
+
+  int32_t operator()(size_t a, size_t b, bool diagonal) const {
+    // An edge needs to show in the image itself and in its difference to the background: an edge of the
+    // background alone is no boundary of the subject, nor is one that the background shows as well.
+    float seen = 0, new_ = 0;
+    const int channels = residual_.difference.channels;
+    for (int c = 0; c < channels; ++c) {
+      const float noise =
+          residual_.variance.values[c][a] + residual_.variance.values[c][b] + edge_lightness * edge_lightness;
+      const float in_body = residual_.body.values[c][a] - residual_.body.values[c][b];
+      const float in_difference = residual_.difference.values[c][a] - residual_.difference.values[c][b];
+      seen += in_body * in_body / noise;
+      new_ += in_difference * in_difference / noise;
+    }
+    const float edge = std::min(seen, new_) / static_cast<float>(channels);
+    const float distance = diagonal ? 0.70710678F : 1.0F;
+    return static_cast<int32_t>(smoothness_ * distance * std::exp(-0.5F * edge)) + 1;
+  }
+
+ private:
+  const Residual& residual_;
+  float smoothness_;
+};
+
+/// Cells whose neighbourhood agrees so clearly that no boundary can run there; the others are the graph's nodes.
+enum class Certainty : uint8_t { open, subject, background };
+
+std::vector<Certainty> certain_cells(const std::vector<float>& evidence, const CellGrid& grid) {
+  // Runs of clear cells of ± reach in both axes, as an erosion in two passes.
+  constexpr int reach = 2;
+  constexpr float clear_subject = 3;
+  constexpr float clear_background = -2;
+  std::vector<Certainty> clear(grid.count(), Certainty::open), rows(grid.count(), Certainty::open);
+  for (size_t i = 0; i < clear.size(); ++i) {
+    if (evidence[i] > clear_subject) clear[i] = Certainty::subject;
+    if (evidence[i] < clear_background) clear[i] = Certainty::background;
+  }
+  for (int y = 0; y < grid.height; ++y) {
+    int run = 0;  // equal clear cells that end here
+    for (int x = 0; x < grid.width + reach; ++x) {
+      if (x < grid.width) {
+        const bool same = x > 0 && clear[grid.index(x, y)] == clear[grid.index(x - 1, y)];
+        run = same ? run + 1 : 1;
+        // The image's border agrees with whatever is beside it.
+        if (x == 0) run = 1 + reach;
+      } else {
+        ++run;
+      }
+      const int center = x - reach;
+      if (center < 0) continue;
+      if (run >= 2 * reach + 1) rows[grid.index(center, y)] = clear[grid.index(center, y)];
+    }
+  }
+  std::vector<Certainty> certain(grid.count(), Certainty::open);
+  for (int x = 0; x < grid.width; ++x) {
+    int run = 0;
+    for (int y = 0; y < grid.height + reach; ++y) {
+      if (y < grid.height) {
+        const bool same = y > 0 && rows[grid.index(x, y)] == rows[grid.index(x, y - 1)];
+        run = same ? run + 1 : 1;
+        if (y == 0) run = 1 + reach;
+      } else {
+        ++run;
+      }
+      const int center = y - reach;
+      if (center < 0) continue;
+      if (run >= 2 * reach + 1) certain[grid.index(x, center)] = rows[grid.index(x, center)];
+    }
+  }
+  return certain;
+}
+
+CellMask cut(const std::vector<float>& evidence, const Residual& residual, const CellGrid& grid, double smoothness) {
+  const std::vector<Certainty> certain = certain_cells(evidence, grid);
+  std::vector<int32_t> node_of(grid.count(), -1);
+  std::vector<size_t> cell_of;
+  for (size_t i = 0; i < certain.size(); ++i) {
+    if (certain[i] != Certainty::open) continue;
+    node_of[i] = static_cast<int32_t>(cell_of.size());
+    cell_of.push_back(i);
+  }
+  const BoundaryCost cost(residual, smoothness);
+  CutGraph graph;
+  graph.nodes.resize(cell_of.size());
+  for (size_t n = 0; n < cell_of.size(); ++n) {
+    const size_t cell = cell_of[n];
+    const int x = static_cast<int>(cell % static_cast<size_t>(grid.width));
+    const int y = static_cast<int>(cell / static_cast<size_t>(grid.width));
+    CutGraph::Node& node = graph.nodes[n];
+    node.terminal += static_cast<int32_t>(evidence[cell] * capacity_scale);
+    for (int k = 0; k < 8; ++k) {
+      const int nx = x + neighbor_steps[k][0];
+      const int ny = y + neighbor_steps[k][1];
+      if (!grid.contains(nx, ny)) continue;
+      const size_t other = grid.index(nx, ny);
+      if (certain[other] != Certainty::open) {
+        const int32_t price = cost(cell, other, k == 0 || k == 2 || k == 5 || k == 7);
+        node.terminal += certain[other] == Certainty::subject ? price : -price;
+        continue;
+      }
+      node.neighbor[k] = node_of[other];
+      if (k < 4) continue;  // set from the other side
+      const int32_t price = cost(cell, other, k == 5 || k == 7);
+      node.capacity[k] = price;
+      graph.nodes[node_of[other]].capacity[7 - k] = price;
+    }
+  }
+  const std::vector<uint8_t> subject_side = minimum_cut(std::move(graph));
+  CellMask mask(grid.count());
+  for (size_t i = 0; i < mask.size(); ++i) {
+    mask[i] = node_of[i] >= 0 ? subject_side[node_of[i]] : certain[i] == Certainty::subject;
+  }
+  return mask;
+}
+
+/// Parts that are tiny beside the largest are specks: noise, insects, a reflection.
+int remove_specks(CellMask& mask, const CellGrid& grid, double smallest_part) {
+  const Components parts = connected_components(mask, grid.width, grid.height, 1, Connectivity::eight);
+  if (parts.areas.empty()) return 0;
+  const size_t largest = *std::max_element(parts.areas.begin(), parts.areas.end());
+  const auto smallest = static_cast<size_t>(smallest_part * static_cast<double>(largest));
+  int kept = 0;
+  for (const size_t area : parts.areas) kept += area >= smallest;
+  for (size_t i = 0; i < mask.size(); ++i) {
+    if (parts.label[i] >= 0 && parts.areas[parts.label[i]] < smallest) mask[i] = 0;
+  }
+  return kept;
+}
+
+/// A hole through which one sees the background has a rim that shows as an edge. One without is a piece of the
+/// subject that happens to look like the background behind it.
+void fill_false_holes(CellMask& mask, const CellGrid& grid, const std::vector<float>& evidence,
+                      const Residual& residual) {
+  const Components gaps = connected_components(mask, grid.width, grid.height, 0, Connectivity::four);
+  const size_t n = gaps.areas.size();
+  std::vector<uint8_t> open(n, 0);
+  std::vector<double> rim(n, 0), price(n, 0), looks(n, 0);
+  const BoundaryCost cost(residual, 1);
+  for (int y = 0; y < grid.height; ++y) {
+    for (int x = 0; x < grid.width; ++x) {
+      const int32_t gap = gaps.label[grid.index(x, y)];
+      if (gap < 0) continue;
+      if (x == 0 || y == 0 || x == grid.width - 1 || y == grid.height - 1) open[gap] = 1;
+      looks[gap] += evidence[grid.index(x, y)];
+      for (const int k : {1, 3, 4, 6}) {
+        const int nx = x + neighbor_steps[k][0];
+        const int ny = y + neighbor_steps[k][1];
+        if (!grid.contains(nx, ny) || mask[grid.index(nx, ny)] == 0) continue;
+        rim[gap] += 1;
+        price[gap] += cost(grid.index(x, y), grid.index(nx, ny), false) / static_cast<double>(capacity_scale);
+      }
+    }
+  }
+  // A rim counts as an edge when a boundary costs less than this share of what it costs in flat colour; a hole of a
+  // few cells must on top look like background on average, as noise inside dark clothes does not.
+  constexpr double faint_rim = 0.6;
+  constexpr size_t few_cells = 12;
+  for (size_t i = 0; i < mask.size(); ++i) {
+    const int32_t gap = gaps.label[i];
+    if (gap < 0 || open[gap] != 0) continue;
+    const bool faint = price[gap] > faint_rim * rim[gap];
+    const bool doubtful = gaps.areas[gap] < few_cells && looks[gap] > -0.5 * static_cast<double>(gaps.areas[gap]);
+    if (faint || doubtful) mask[i] = 1;
+  }
+}
+
+}  // namespace
+
+Labeling label_cells(const CellGrid& grid, const Residual& residual, const LabelingOptions& options) {
+  const Evidence evidence_of(residual, options);
+  std::vector<float> evidence(grid.count());
+  for (size_t i = 0; i < evidence.size(); ++i) evidence[i] = evidence_of(i);
+
+  Labeling labeling;
+  labeling.subject = cut(evidence, residual, grid, options.smoothness);
+  labeling.parts = remove_specks(labeling.subject, grid, options.smallest_part);
+  fill_false_holes(labeling.subject, grid, evidence, residual);
+  std::vector<float> of_subject;
+  for (size_t i = 0; i < evidence.size(); ++i) {
+    if (labeling.subject[i] != 0) of_subject.push_back(evidence[i]);
+  }
+  labeling.subject_cells = of_subject.size();
+  if (!of_subject.empty()) {
+    const auto middle = of_subject.begin() + static_cast<long>(of_subject.size() / 2);
+    std::nth_element(of_subject.begin(), middle, of_subject.end());
+    labeling.contrast = std::clamp(*middle / largest_evidence, 0.0F, 1.0F);
+  }
+  return labeling;
+}
+
+}  // namespace booth::segmentation

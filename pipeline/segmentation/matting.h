@@ -1,0 +1,22 @@
+#pragma once
+
+#include <span>
+
+#include "pipeline/segmentation/background_model.h"
+#include "pipeline/segmentation/labeling.h"
+#include "pipeline/types/frame.h"
+#include "pipeline/types/image.h"
+
+namespace booth::segmentation {
+
+/// The share of every pixel that the subject covers, 0 … 255, from labels that are right to a cell or two.
+///
+/// In a band along the labels' boundary the pixel's colour I lies between the background's B, which is known from
+/// the empty booth under the drift and shadow seen just outside, and the subject's F, seen just inside: coverage is
+/// the projection of I − B on F − B. It is taken in linear light, where a lens and a sensor mix what a pixel covers;
+/// in sRGB the outline of a dark subject before a bright wall would move outwards by a quarter of its blur.
+/// Where F and B hardly differ the labels' own outline, smoothed, takes over.
+Image matte(std::span<const Frame> background, const Image& body, const CellGrid& grid, const Residual& residual,
+            const CellMask& subject);
+
+}  // namespace booth::segmentation
