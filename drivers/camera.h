@@ -30,8 +30,9 @@ class Camera {
   virtual ~Camera() = default;
   virtual const CameraInfo& info() const = 0;
 
-  /// Ready to deliver `count` triggered frames, indices 0 … count − 1. Settings that the device cannot meet are
-  /// an error, never rounded. @error device_lost, invalid_argument, unsupported
+  /// Ready to deliver `count` triggered frames, indices 0 … count − 1; further triggers are not answered. An armed
+  /// camera begins anew: frames that were not fetched are dropped. Settings that the device cannot meet are an
+  /// error, never rounded. @error device_lost, invalid_argument, unsupported
   virtual Result<void> arm(const CaptureSettings& settings, int count) = 0;
 
   /// The next frame in trigger order; its index says which trigger it answers, so a lost frame leaves a gap.

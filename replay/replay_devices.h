@@ -10,14 +10,17 @@
 
 namespace booth {
 
+class ReplayStage;
+
 /// Plays a recording through the drivers' interfaces, as often as asked: one camera for each of the rig's, a
 /// trigger, and the projector where the rig has one.
 ///
-/// A camera armed for a role answers trigger k with the k-th frame that the recording's first shot of that role
-/// has of it (from the first again when there are fewer), in a gray_code shot with the frame of the pattern that
-/// the projector shows at that instant (dark: the all-black one). A camera without a frame there stays silent, as
-/// a broken one would. Timestamps are the trigger's instant plus the recorded offset between the cameras. Frames
-/// are decoded when they are asked for and carry their encoded bytes.
+/// A camera armed for a role answers trigger k with its frame of the k-th index that the recording's first shot of
+/// that role has (from the first again when there are fewer). A gray_code shot is answered with the frame of the
+/// pattern that the projector shows at that instant (dark: the all-black one), a calibration_board shot with the pose
+/// after the last one, also across arms. A camera without such a frame stays silent, as a broken one would. Timestamps
+/// are the trigger's instant plus the recorded offset between the cameras. Frames are decoded by the thread that waits
+/// for them, and carry their encoded bytes.
 class ReplaySource final : public DeviceSource {
  public:
   /// @param clock  outlives the source and its devices
@@ -39,9 +42,8 @@ class ReplaySource final : public DeviceSource {
   void plug_in(const std::string& device);
 
  private:
-  struct Stage;
-  explicit ReplaySource(std::shared_ptr<Stage> stage);
-  std::shared_ptr<Stage> stage_;
+  explicit ReplaySource(std::shared_ptr<ReplayStage> stage);
+  std::shared_ptr<ReplayStage> stage_;
 };
 
 }  // namespace booth
