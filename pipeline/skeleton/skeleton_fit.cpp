@@ -1,2 +1,815 @@
 #include "pipeline/skeleton/skeleton_fit.h"
-namespace booth { Result<FittedSkeleton> fit_skeleton(const Mesh&, const SkeletonOptions&, const Work&) { return Error{ErrorCode::unsupported, "pending"}; } }
+
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <optional>
+#include <utility>
+
+#include "pipeline/skeleton/interior.h"
+
+namespace booth {
+namespace {
+
+using Eigen::Vector3d;
+
+// Proportions of people, as shares of stature unless a comment says otherwise. Lengths between joint centres are the
+// means of de Leva's men and women; heights and breadths are Drillis and Contini's where they give them.
+constexpr double upper_arm_share = 0.150;   // shoulder to elbow; de Leva 0.160, less as stature here has shoes and hair
+constexpr double hand_of_arm = 0.25;        // wrist to fingertip, of shoulder to fingertip
+constexpr double forearm_of_arm = 0.36;     // elbow to wrist, likewise
+constexpr double longest_arm_share = 0.48;  // what is longer holds something
+constexpr double shoulder_half_share = 0.105;   // middle to shoulder joint: half the biacromial breadth less 0.01
+constexpr double shoulder_cover_share = 0.031;  // shoulder joint to the skin above and beside it
+constexpr double hip_half_share = 0.060;        // middle to hip joint
+constexpr double hip_height_share = 0.52;       // of adults
+constexpr double hip_of_crotch = 1.14;          // hip joints' height, of the crotch's
+constexpr double knee_of_leg = 0.51;            // ankle to knee, of ankle to hip
+constexpr double ankle_height_share = 0.043;
+constexpr double foot_share = 0.152;           // length of a foot
+constexpr double ball_of_foot = 0.72;          // ankle to the ball of the foot, of ankle to toe tip
+constexpr double neck_height_share = 0.875;    // narrowest part of the neck
+constexpr double adult_head_share = 0.12;      // narrowest part of the neck to the crown
+constexpr double spine_of_trunk_depth = 0.37;  // the column of vertebrae, from the back
+
+enum Side { left = 0, right = 1 };
+double sign(size_t side) { return side == left ? 1 : -1; }
+const char* name(size_t side) { return side == left ? "left" : "right"; }
+
+Error not_riggable(const std::string& why) { return {ErrorCode::not_riggable, "skeleton: " + why}; }
+
+/// The body with its measures.
+struct Body {
+  Interior interior;
+  double floor = 0;    // y of the soles
+  double stature = 0;  // metres
+  Geodesics from_core;
+
+  double voxel() const { return interior.grid.voxel_m; }
+  double height(double share) const { return floor + share * stature; }
+  int row(double y) const {
+    return std::clamp(static_cast<int>(std::lround((y - interior.grid.origin.y()) / voxel())), 0,
+                      interior.grid.size[1] - 1);
+  }
+  double row_y(int j) const { return interior.grid.origin.y() + j * voxel(); }
+  bool solid(int i, int j, int k) const { return interior.depth_m[interior.index(i, j, k)] > 0; }
+};
+
+/// Which ends of the shape are what.
+struct Ends {
+  size_t head = 0;
+  std::array<std::optional<size_t>, 2> hand, foot;  // left, right
+};
+
+struct TrunkJoints {
+  Vector3d hips, spine, spine1, spine2, neck, head, crown;
+};
+struct ArmJoints {
+  Vector3d clavicle, shoulder, elbow, wrist, fingers;
+};
+struct LegJoints {
+  Vector3d hip, knee, ankle, ball, toes;
+};
+
+// ---- measuring -----------------------------------------------------------------------------------------------------
+
+/// A weighted mean that is empty until something counts.
+struct Centroid {
+  Vector3d sum = Vector3d::Zero();
+  double weight = 0;
+  void add(const Vector3d& p, double w) {
+    sum += w * p;
+    weight += w;
+  }
+  Vector3d mean() const { return sum / weight; }
+};
+
+/// Deep voxels count more: webs and cloth beside a limb hardly move its centre.
+double centre_weight(double depth) { return depth * depth; }
+
+/// The centre of the body within a box around a point, or the point itself where there is none.
+Vector3d centre_near(const Body& body, const Vector3d& p, const Vector3d& half) {
+  const Grid& grid = body.interior.grid;
+  std::array<int, 3> low{}, high{};
+  for (size_t axis = 0; axis < 3; ++axis) {
+    const double at = (p - grid.origin)[static_cast<int>(axis)] / grid.voxel_m,
+                 reach = half[static_cast<int>(axis)] / grid.voxel_m;
+    low[axis] = std::max(0, static_cast<int>(std::ceil(at - reach)));
+    high[axis] = std::min(grid.size[axis] - 1, static_cast<int>(std::floor(at + reach)));
+  }
+  Centroid centre;
+  for (int k = low[2]; k <= high[2]; ++k)
+    for (int j = low[1]; j <= high[1]; ++j)
+      for (int i = low[0]; i <= high[0]; ++i)
+        centre.add(grid.point(i, j, k),
+                   centre_weight(static_cast<double>(body.interior.depth_m[body.interior.index(i, j, k)])));
+  return centre.weight > 0 ? centre.mean() : p;
+}
+
+/// The stretch of a row, seen from the front, that holds x; empty (low > high) where the row has none there.
+struct Run {
+  double low = 0, high = -1;
+  bool empty() const { return low > high; }
+  double width() const { return high - low; }
+};
+Run run_at(const Body& body, double y, double x) {
+  const Grid& grid = body.interior.grid;
+  const int j = body.row(y);
+  const auto filled = [&](int i) {
+    for (int k = 0; k < grid.size[2]; ++k)
+      if (body.solid(i, j, k)) return true;
+    return false;
+  };
+  const int start = static_cast<int>(std::lround((x - grid.origin.x()) / grid.voxel_m));
+  if (start < 0 || start >= grid.size[0] || !filled(start)) return {};
+  int low = start, high = start;
+  while (low > 0 && filled(low - 1)) --low;
+  while (high + 1 < grid.size[0] && filled(high + 1)) ++high;
+  return {grid.point(low, 0, 0).x() - 0.5 * grid.voxel_m, grid.point(high, 0, 0).x() + 0.5 * grid.voxel_m};
+}
+
+/// From back to front: the stretch of z that the body fills around (x, y).
+Run depth_run(const Body& body, double x, double y, double half_width, double half_height) {
+  const Grid& grid = body.interior.grid;
+  std::vector<double> lows, highs;
+  for (int j = body.row(y - half_height); j <= body.row(y + half_height); ++j)
+    for (int i = 0; i < grid.size[0]; ++i) {
+      if (std::abs(grid.point(i, 0, 0).x() - x) > half_width) continue;
+      int first = -1, last = -1;
+      for (int k = 0; k < grid.size[2]; ++k)
+        if (body.solid(i, j, k)) {
+          if (first < 0) first = k;
+          last = k;
+        }
+      if (first < 0) continue;
+      lows.push_back(grid.point(0, 0, first).z());
+      highs.push_back(grid.point(0, 0, last).z());
+    }
+  if (lows.empty()) return {};
+  const auto median = [](std::vector<double>& values) {
+    std::nth_element(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2), values.end());
+    return values[values.size() / 2];
+  };
+  return {median(lows), median(highs)};
+}
+
+/// The nearest place at least two voxels (or as deep as it gets there) under the skin.
+Vector3d pulled_inside(const Body& body, const Vector3d& p) {
+  const double enough = 1.5 * body.voxel();
+  if (body.interior.depth(p) >= enough) return p;
+  double nearest = std::numeric_limits<double>::infinity();
+  Vector3d best = p;
+  for (const uint32_t v : body.interior.inside) {
+    if (static_cast<double>(body.interior.depth_m[v]) < enough) continue;
+    const Vector3d q = body.interior.point(v);
+    const double distance = (q - p).squaredNorm();
+    if (distance < nearest) {
+      nearest = distance;
+      best = q;
+    }
+  }
+  return best;
+}
+
+// ---- the body and its ends -----------------------------------------------------------------------------------------
+
+Result<Body> measure(const Mesh& mesh, const SkeletonOptions& options) {
+  Eigen::AlignedBox3f box;
+  for (const Eigen::Vector3f& p : mesh.positions) box.extend(p);
+  // People are taller than wide even in a T-pose with shoes off, and several times taller than deep.
+  const Eigen::Vector3f size = box.sizes();
+  if (mesh.triangles.empty() || !(size.y() > 0)) return not_riggable("the mesh is empty");
+  if (size.x() > 1.5F * size.y() || size.z() > size.y())
+    return not_riggable("the shape is wider or deeper than a standing person is tall");
+  Body body;
+  body.interior = sample_interior(mesh, options.cells);
+  if (body.interior.inside.empty()) return not_riggable("the mesh encloses nothing");
+  int low = body.interior.grid.size[1], high = 0;
+  for (const uint32_t v : body.interior.inside) {
+    const int j = body.interior.cell(v)[1];
+    low = std::min(low, j);
+    high = std::max(high, j);
+  }
+  body.floor = body.row_y(low) - 0.5 * body.voxel();
+  body.stature = (high - low + 1) * body.voxel();
+  return body;
+}
+
+/// The deepest voxel of the trunk.
+std::optional<size_t> find_core(const Body& body) {
+  std::optional<size_t> core;
+  for (const uint32_t v : body.interior.inside) {
+    const double y = body.interior.point(v).y();
+    if (y < body.height(0.45) || y > body.height(0.75)) continue;
+    if (!core || body.interior.depth_m[v] > body.interior.depth_m[*core]) core = v;
+  }
+  return core;
+}
+
+/// The most prominent extremity of each kind. Those of hair, a bag or a hem stand out less or elsewhere.
+Result<Ends> classify(const Body& body, const std::vector<Extremity>& extremities) {
+  const double per_stature = 10 * body.stature / body.voxel();  // geodesic steps
+  Ends ends;
+  std::optional<Extremity> head;
+  for (const Extremity& e : extremities) {
+    const double y = body.interior.point(e.tip).y();
+    if (y > body.height(0.85) && (!head || y > body.interior.point(head->tip).y())) head = e;
+  }
+  if (!head) return not_riggable("nothing stands out at the top as a head does");
+  ends.head = head->tip;
+
+  std::vector<Extremity> feet;
+  for (const Extremity& e : extremities)
+    if (body.interior.point(e.tip).y() < body.height(0.12) && e.persistence() > 0.06 * per_stature) feet.push_back(e);
+  const auto more_prominent = [](const Extremity& a, const Extremity& b) { return a.persistence() > b.persistence(); };
+  std::stable_sort(feet.begin(), feet.end(), more_prominent);
+  if (feet.size() > 2 && feet[2].persistence() > 0.25 * per_stature)
+    return not_riggable("the shape stands on more than two legs");
+  if (feet.size() >= 2) {
+    const bool ordered = body.interior.point(feet[0].tip).x() > body.interior.point(feet[1].tip).x();
+    ends.foot[left] = feet[ordered ? 0 : 1].tip;
+    ends.foot[right] = feet[ordered ? 1 : 0].tip;
+  }
+
+  const double middle =
+      ends.foot[left] ? 0.5 * (body.interior.point(*ends.foot[left]).x() + body.interior.point(*ends.foot[right]).x())
+                      : body.interior.point(ends.head).x();
+  for (const Extremity& e : extremities) {
+    const Vector3d p = body.interior.point(e.tip);
+    const double aside = p.x() - middle;
+    if (p.y() < body.height(0.2) || p.y() > body.height(0.95) || std::abs(aside) < 0.1 * body.stature) continue;
+    if (e.tip == ends.head || e.persistence() < 0.1 * per_stature) continue;
+    std::optional<size_t>& hand = ends.hand[aside > 0 ? left : right];
+    if (!hand) hand = e.tip;  // farthest first: the hand is the farthest of its side
+  }
+  return ends;
+}
+
+// ---- limbs ---------------------------------------------------------------------------------------------------------
+
+/// One place on a limb's centre line.
+struct Station {
+  Vector3d p;
+  double along = 0;    // metres from the tip
+  double area_m2 = 0;  // of the section
+};
+
+/// The centre line of a limb from its tip inwards: centres of slabs of equal geodesic distance.
+std::vector<Station> centre_line(const Body& body, const std::vector<uint32_t>& limb) {
+  constexpr uint32_t slab_steps = 25;  // two and a half voxels
+  std::vector<Centroid> centres;
+  std::vector<size_t> counts;
+  const uint32_t tip_steps = body.from_core.steps[limb.front()];
+  for (const uint32_t v : limb) {
+    const size_t slab = (tip_steps - body.from_core.steps[v]) / slab_steps;
+    if (slab >= centres.size()) {
+      centres.resize(slab + 1);
+      counts.resize(slab + 1, 0);
+    }
+    centres[slab].add(body.interior.point(v), centre_weight(static_cast<double>(body.interior.depth_m[v])));
+    ++counts[slab];
+  }
+  std::vector<Station> line;
+  for (size_t s = 0; s < centres.size(); ++s)
+    if (centres[s].weight > 0)
+      line.push_back(
+          {centres[s].mean(), 0, static_cast<double>(counts[s]) * std::pow(body.voxel(), 2) * 10 / slab_steps});
+  const std::vector<Station> rough = line;
+  for (size_t s = 1; s + 1 < line.size(); ++s)
+    line[s].p = 0.25 * rough[s - 1].p + 0.5 * rough[s].p + 0.25 * rough[s + 1].p;
+  Vector3d before = body.interior.point(limb.front());
+  double along = 0;
+  for (Station& station : line) {
+    along += (station.p - before).norm();
+    station.along = along;
+    before = station.p;
+  }
+  return line;
+}
+
+/// Cuts an arm's centre line where the section swells into the trunk.
+void cut_at_trunk(const Body& body, std::vector<Station>& line) {
+  const double wrist_at_least = 0.17 * body.stature;  // hands swell too, so look only beyond them
+  const double lookback = 0.06 * body.stature;
+  size_t back = 0;
+  for (size_t s = 0; s < line.size(); ++s) {
+    while (line[s].along - line[back].along > lookback) ++back;
+    if (line[s].along > wrist_at_least && line[s].area_m2 > 1.8 * line[back].area_m2 &&
+        line[back].along > 0.1 * body.stature) {
+      line.resize(s);
+      break;
+    }
+  }
+  if (line.size() > 2) line.pop_back();  // the last slab is cut off by the end of the limb
+}
+
+/// The shoulder's outline from the front: the highest inside of every column of x.
+std::vector<double> outline_from_above(const Body& body) {
+  std::vector<double> top(static_cast<size_t>(body.interior.grid.size[0]), -std::numeric_limits<double>::infinity());
+  for (const uint32_t v : body.interior.inside) {
+    const auto [i, j, k] = body.interior.cell(v);
+    top[static_cast<size_t>(i)] = std::max(top[static_cast<size_t>(i)], body.row_y(j) + 0.5 * body.voxel());
+  }
+  return top;
+}
+
+/// The shoulder joint lies under the outline of shoulder and arm as deep as the joint's cover: on the path of the
+/// centre of a ball rolled along the outline from within. Where on the path: by breadth and length of the upper arm.
+Vector3d shoulder_joint(const Body& body, const std::vector<double>& outline, double middle, size_t side, double lowest,
+                        double highest, const std::optional<Vector3d>& elbow, double depth_z) {
+  const double cover = shoulder_cover_share * body.stature;
+  const double voxel = body.voxel();
+  const int reach = static_cast<int>(std::ceil(cover / voxel));
+  double least = std::numeric_limits<double>::infinity();
+  Vector3d best(middle + sign(side) * shoulder_half_share * body.stature, lowest, depth_z);
+  for (int i = reach; i + reach < static_cast<int>(outline.size()); ++i) {
+    const double x = body.interior.grid.point(i, 0, 0).x();
+    const double aside = sign(side) * (x - middle) / body.stature;
+    if (aside < 0.06 || aside > 0.17) continue;
+    double y = std::numeric_limits<double>::infinity();
+    for (int o = -reach; o <= reach; ++o) {
+      const double across = cover * cover - o * o * voxel * voxel;
+      if (across >= 0) y = std::min(y, outline[static_cast<size_t>(i + o)] - std::sqrt(across));
+    }
+    if (!(y > lowest)) continue;
+    const Vector3d p(x, std::min(y, highest), depth_z);
+    const auto squared = [](double v) { return v * v; };
+    double cost = squared((aside - shoulder_half_share) / 0.012);
+    if (elbow) cost += squared(((p - *elbow).norm() / body.stature - upper_arm_share) / 0.015);
+    if (cost < least) {
+      least = cost;
+      best = p;
+    }
+  }
+  return best;
+}
+
+double distance_to_segment(const Vector3d& p, const Vector3d& a, const Vector3d& b) {
+  const double length2 = (b - a).squaredNorm();
+  const double t = length2 > 0 ? std::clamp((p - a).dot(b - a) / length2, 0.0, 1.0) : 0;
+  return (p - a - t * (b - a)).norm();
+}
+
+/// The station at a length along the line, interpolated.
+Vector3d point_along(const std::vector<Station>& line, double along) {
+  for (size_t s = 1; s < line.size(); ++s)
+    if (line[s].along >= along) {
+      const double t =
+          std::clamp((along - line[s - 1].along) / std::max(1e-9, line[s].along - line[s - 1].along), 0.0, 1.0);
+      return line[s - 1].p + t * (line[s].p - line[s - 1].p);
+    }
+  return line.back().p;
+}
+
+/// Where the arm narrows to the wrist, near where its length says; the length's word where it does not narrow.
+double wrist_along(const std::vector<Station>& line, double arm_length) {
+  const double expected = hand_of_arm * arm_length;
+  double palm = 0;
+  size_t narrowest = 0;
+  for (size_t s = 1; s + 1 < line.size(); ++s) {
+    if (line[s].along < 0.7 * expected) palm = std::max(palm, line[s].area_m2);
+    if (line[s].along < 0.7 * expected || line[s].along > 1.35 * expected) continue;
+    if (line[s].area_m2 <= line[s - 1].area_m2 && line[s].area_m2 <= line[s + 1].area_m2 &&
+        (narrowest == 0 || line[s].area_m2 < line[narrowest].area_m2))
+      narrowest = s;
+  }
+  constexpr double clearly = 0.85;
+  if (narrowest == 0 || line[narrowest].area_m2 > clearly * palm) return expected;
+  return 0.5 * (expected + line[narrowest].along);
+}
+
+/// The bend of the arm: the station E for which the straight pieces wrist–E–shoulder follow the centre line best,
+/// weighed against the proportions of the arm.
+size_t elbow_station(const Body& body, const std::vector<Station>& line, double wrist) {
+  const double arm_length = line.back().along;
+  const double expected = hand_of_arm + forearm_of_arm;
+  const double tolerance = 0.005 * body.stature;
+  size_t first = 0;
+  while (first + 1 < line.size() && line[first].along < wrist) ++first;
+  double least = std::numeric_limits<double>::infinity();
+  size_t best = first;
+  for (size_t e = first + 1; e + 1 < line.size(); ++e) {
+    const double share = line[e].along / arm_length;
+    if (share < 0.48 || share > 0.75) continue;
+    double misfit = 0;
+    for (size_t s = first; s < line.size(); ++s) {
+      const double d = s < e ? distance_to_segment(line[s].p, line[first].p, line[e].p)
+                             : distance_to_segment(line[s].p, line[e].p, line.back().p);
+      misfit += d * d;
+    }
+    misfit /= static_cast<double>(line.size() - first) * tolerance * tolerance;
+    const double unusual = (share - expected) / 0.025;
+    const double cost = misfit + unusual * unusual;
+    if (cost < least) {
+      least = cost;
+      best = e;
+    }
+  }
+  return best;
+}
+
+/// The centre line continued straight to the shoulder.
+std::vector<Station> with_shoulder(const Body& body, std::vector<Station> line, const Vector3d& shoulder) {
+  const Vector3d from = line.back().p;
+  const double gap = (shoulder - from).norm();
+  const int pieces = std::max(1, static_cast<int>(std::lround(gap / (2.5 * body.voxel()))));
+  const double start = line.back().along;
+  for (int n = 1; n <= pieces; ++n) {
+    const double t = static_cast<double>(n) / pieces;
+    line.push_back({from + t * (shoulder - from), start + t * gap, 0});
+  }
+  return line;
+}
+
+ArmJoints trace_arm(const Body& body, const std::vector<uint32_t>& limb, const std::vector<double>& outline,
+                    double middle, size_t side, double lowest_shoulder, const TrunkJoints& trunk,
+                    std::vector<std::string>& warnings) {
+  std::vector<Station> line = centre_line(body, limb);
+  cut_at_trunk(body, line);
+  const double shoulder_z = 0.5 * (trunk.neck.z() + trunk.spine2.z());
+  ArmJoints arm;
+  arm.fingers = body.interior.point(limb.front());
+  std::optional<Vector3d> elbow;
+  constexpr int rounds = 2;  // the shoulder's place depends on the elbow's and the other way round
+  for (int round = 0; round < rounds; ++round) {
+    arm.shoulder = shoulder_joint(body, outline, middle, side, lowest_shoulder, trunk.neck.y(), elbow, shoulder_z);
+    const double near = 0.02 * body.stature;
+    arm.shoulder.z() = centre_near(body, arm.shoulder, {near, near, body.stature}).z();
+    std::vector<Station> whole = with_shoulder(body, line, arm.shoulder);
+    if (const double excess = whole.back().along - longest_arm_share * body.stature; excess > 0) {
+      // Something is held: count the arm from the shoulder.
+      const double usual = 0.42 * body.stature, spare = whole.back().along - usual;
+      if (round == 0)
+        warnings.push_back(std::string("the ") + name(side) +
+                           " arm is too long; what it holds was left out by proportions");
+      std::erase_if(whole, [&](const Station& s) { return s.along < spare; });
+      for (Station& s : whole) s.along -= spare;
+      arm.fingers = whole.front().p;
+    }
+    const double wrist = wrist_along(whole, whole.back().along);
+    arm.wrist = point_along(whole, wrist);
+    arm.elbow = whole[elbow_station(body, whole, wrist)].p;
+    elbow = arm.elbow;
+  }
+  return arm;
+}
+
+/// An arm that cannot be told from the trunk: hanging straight down from the shoulder.
+ArmJoints hanging_arm(const Body& body, const std::vector<double>& outline, double middle, size_t side,
+                      double lowest_shoulder, const TrunkJoints& trunk) {
+  ArmJoints arm;
+  arm.shoulder = shoulder_joint(body, outline, middle, side, lowest_shoulder, trunk.neck.y(), std::nullopt,
+                                0.5 * (trunk.neck.z() + trunk.spine2.z()));
+  const double near = 0.02 * body.stature;
+  const double length = upper_arm_share / (1 - hand_of_arm - forearm_of_arm) * body.stature;
+  const auto below = [&](double share) {
+    // As far out as the body goes there, less what covers the bone.
+    const double y = arm.shoulder.y() - share * length;
+    const Run run = run_at(body, y, middle);
+    Vector3d p(run.empty() ? arm.shoulder.x()
+                           : (side == left ? run.high : run.low) - sign(side) * shoulder_cover_share * body.stature,
+               y, arm.shoulder.z());
+    p.z() = centre_near(body, p, {near, near, body.stature}).z();
+    return p;
+  };
+  arm.elbow = below(1 - hand_of_arm - forearm_of_arm);
+  arm.wrist = below(1 - hand_of_arm);
+  arm.fingers = below(1);
+  return arm;
+}
+
+/// A leg's centre, row by row, from the floor to the crotch; rows without a centre are left out.
+std::vector<Vector3d> leg_rows(const Body& body, const std::vector<uint32_t>& limb, double top) {
+  std::vector<Centroid> rows(static_cast<size_t>(body.interior.grid.size[1]));
+  for (const uint32_t v : limb)
+    rows[static_cast<size_t>(body.interior.cell(v)[1])].add(
+        body.interior.point(v), centre_weight(static_cast<double>(body.interior.depth_m[v])));
+  std::vector<Vector3d> line;
+  for (const Centroid& row : rows)
+    if (row.weight > 0 && row.mean().y() < top) line.push_back(row.mean());
+  return line;
+}
+
+/// The straight line through the rows of a leg within some heights, at another height.
+std::optional<Vector3d> extrapolate(const std::vector<Vector3d>& rows, double low, double high, double y) {
+  std::vector<Vector3d> used;
+  Vector3d mean = Vector3d::Zero();
+  for (const Vector3d& p : rows)
+    if (p.y() >= low && p.y() <= high) {
+      used.push_back(p);
+      mean += p;
+    }
+  if (used.size() < 3) return std::nullopt;
+  mean /= static_cast<double>(used.size());
+  double spread = 0;
+  Vector3d slope = Vector3d::Zero();
+  for (const Vector3d& p : used) {
+    spread += (p.y() - mean.y()) * (p.y() - mean.y());
+    slope += (p.y() - mean.y()) * (p - mean);
+  }
+  return mean + (y - mean.y()) / spread * slope;
+}
+
+/// The lowest row, upwards from the shins, in which both legs are one; that is the crotch, or the hem of a skirt.
+double where_legs_meet(const Body& body, const std::vector<Vector3d>& left_rows,
+                       const std::vector<Vector3d>& right_rows) {
+  for (double y = body.height(0.12); y < body.height(0.6); y += body.voxel()) {
+    const auto at = [&](const std::vector<Vector3d>& rows) {
+      double x = rows.front().x();
+      for (const Vector3d& p : rows)
+        if (p.y() <= y + 0.5 * body.voxel()) x = p.x();
+      return x;
+    };
+    const Run run = run_at(body, y, at(left_rows));
+    if (!run.empty() && run.low < at(right_rows)) return y;
+  }
+  return body.height(0.6);
+}
+
+void add_foot(const Body& body, const std::vector<uint32_t>& limb, LegJoints& leg) {
+  // The toes are the voxels of the foot that lie farthest from the ankle towards the front.
+  double farthest = -std::numeric_limits<double>::infinity();
+  for (const uint32_t v : limb) {
+    const Vector3d p = body.interior.point(v);
+    if (p.y() > body.height(0.05)) continue;
+    const Vector3d way = p - leg.ankle;
+    const double reach = Eigen::Vector2d(way.x(), way.z()).norm();
+    if (way.z() > 0.5 * reach && reach > farthest) {
+      farthest = reach;
+      leg.toes = p;
+    }
+  }
+  if (!(farthest > 0)) leg.toes = leg.ankle + Vector3d(0, 0, 0.7 * foot_share * body.stature);
+  leg.toes.y() = body.height(0.012);
+  leg.ball = leg.ankle + ball_of_foot * (leg.toes - leg.ankle);
+  leg.ball.y() = body.height(0.018);
+}
+
+// ---- trunk ---------------------------------------------------------------------------------------------------------
+
+struct NeckMeasure {
+  double y = 0;      // of the narrowest part
+  bool seen = true;  // false: covered by hair or a hood
+};
+
+NeckMeasure find_neck(const Body& body, double x) {
+  NeckMeasure neck{body.height(neck_height_share), false};
+  double narrowest = std::numeric_limits<double>::infinity(), head = 0;
+  // From the crown downwards; the head is the widest so far, the neck the narrowest below it.
+  double head_y = body.height(1);
+  for (double y = body.height(0.985); y > body.height(0.76); y -= body.voxel()) {
+    const double width = run_at(body, y, x).width();
+    if (width <= 0) continue;
+    if (width > head && y > body.height(0.86)) {
+      if (narrowest > 0.8 * head) narrowest = std::numeric_limits<double>::infinity();
+      head = width;
+      head_y = y;
+    }
+    if (width < narrowest && y < head_y) {
+      narrowest = width;
+      neck.y = y;
+    }
+    if (narrowest < 0.85 * head && width > 1.5 * narrowest) break;  // shoulders
+  }
+  // The narrowest part is a stretch; take its middle.
+  double sum = 0;
+  int rows = 0;
+  for (double y = neck.y + 0.03 * body.stature; y > neck.y - 0.03 * body.stature; y -= body.voxel())
+    if (run_at(body, y, x).width() < 1.08 * narrowest) {
+      sum += y;
+      ++rows;
+    }
+  neck.seen = narrowest < 0.85 * head && rows > 0;
+  neck.y = neck.seen ? sum / rows : body.height(neck_height_share);
+  return neck;
+}
+
+/// Hip joints' height from the crotch, checked against stature and the size of the head: the smaller the person, the
+/// larger the head and the shorter the legs (children of three: head 0.18, hips 0.45 of stature; Snyder et al. 1977).
+double hip_height(const Body& body, const NeckMeasure& neck, std::optional<double> crotch,
+                  std::vector<std::string>& warnings) {
+  const double head_share = neck.seen ? 1 - (neck.y - body.floor) / body.stature : adult_head_share;
+  const double usual = std::clamp(hip_height_share - 1.2 * (head_share - adult_head_share), 0.42, 0.53);
+  if (!crotch) return body.height(usual);
+  const double measured = hip_of_crotch * (*crotch - body.floor) / body.stature;
+  if (std::abs(measured - usual) > 0.07) {
+    warnings.emplace_back(measured < usual ? "the legs are one down to " +
+                                                 std::to_string(std::lround(100 * (*crotch - body.floor))) +
+                                                 " cm (a skirt?); the hips were placed by proportions"
+                                           : "no crotch was found; the hips were placed by proportions");
+    return body.height(usual);
+  }
+  return body.height(0.6 * measured + 0.4 * usual);
+}
+
+TrunkJoints place_trunk(const Body& body, const Ends& ends, const NeckMeasure& neck, double hip_y, double hip_x) {
+  const double h = body.stature;
+  const double head_height = body.height(1) - neck.y;
+  TrunkJoints trunk;
+  const double crown_x = body.interior.point(ends.head).x();
+  const Run skull_run = run_at(body, body.height(1) - 0.4 * head_height, crown_x);
+  const double head_x = skull_run.empty() ? crown_x : 0.5 * (skull_run.low + skull_run.high);
+  const Vector3d skull =
+      centre_near(body, {head_x, body.height(1) - 0.4 * head_height, 0.5 * (body.interior.point(ends.head).z())},
+                  {0.08 * h, 0.25 * head_height, h});
+  const auto spine_at = [&](double y, double x) {
+    const Run run = depth_run(body, x, y, 0.02 * h, 0.015 * h);
+    const double z = run.empty() ? skull.z() : run.low + spine_of_trunk_depth * run.width();
+    return Vector3d(x, y, z);
+  };
+  const double neck_y = neck.y - 0.25 * head_height;
+  const auto x_at = [&](double y) { return hip_x + (skull.x() - hip_x) * (y - hip_y) / (skull.y() - hip_y); };
+  const auto trunk_at = [&](double share) {
+    const double y = hip_y + share * (neck_y - hip_y);
+    return spine_at(y, x_at(y));
+  };
+  trunk.hips = trunk_at(0);
+  trunk.spine = trunk_at(0.08);
+  trunk.spine1 = trunk_at(0.32);
+  trunk.spine2 = trunk_at(0.62);
+  trunk.head = {skull.x(), neck.y + 0.22 * head_height, skull.z() - 0.01 * h};
+  const Vector3d throat = centre_near(body, {x_at(neck_y), neck_y, skull.z()}, {0.03 * h, 0.015 * h, h});
+  trunk.neck = {0.5 * (throat.x() + x_at(neck_y)), neck_y,
+                0.5 * throat.z() + 0.25 * (trunk.spine2.z() + trunk.head.z())};
+  trunk.crown = {skull.x(), body.height(1) - 0.01 * h, body.interior.point(ends.head).z()};
+  return trunk;
+}
+
+// ---- the joint tree ------------------------------------------------------------------------------------------------
+
+/// A frame at `at` with +Y along `along` and +Z as near to `ahead` as that leaves it.
+Eigen::Isometry3d bone_frame(const Vector3d& at, const Vector3d& along, const Vector3d& ahead) {
+  Vector3d y = along.normalized();
+  if (!(along.norm() > 1e-9)) y = Vector3d::UnitY();
+  Vector3d reference = ahead;
+  constexpr double nearly_parallel = 0.95;
+  if (std::abs(y.dot(reference)) > nearly_parallel) reference = Vector3d::UnitY();
+  const Vector3d z = (reference - reference.dot(y) * y).normalized();
+  Eigen::Isometry3d frame = Eigen::Isometry3d::Identity();
+  frame.linear().col(0) = y.cross(z);
+  frame.linear().col(1) = y;
+  frame.linear().col(2) = z;
+  frame.translation() = at;
+  return frame;
+}
+
+class SkeletonBuilder {
+ public:
+  /// Adds a joint at `at` whose bone ends at `to`.
+  int add(const std::string& joint, int parent, const Vector3d& at, const Vector3d& to, const Vector3d& ahead) {
+    world_.push_back(bone_frame(at, to - at, ahead));
+    const Eigen::Isometry3d& world = world_.back();
+    skeleton_.joints.push_back(
+        {joint, parent, parent < 0 ? world : world_[static_cast<size_t>(parent)].inverse() * world});
+    return static_cast<int>(world_.size()) - 1;
+  }
+  Skeleton take() { return std::move(skeleton_); }
+
+ private:
+  Skeleton skeleton_;
+  std::vector<Eigen::Isometry3d> world_;
+};
+
+Skeleton build(const TrunkJoints& trunk, const std::array<ArmJoints, 2>& arms, const std::array<LegJoints, 2>& legs) {
+  const Vector3d forward = Vector3d::UnitZ(), up = Vector3d::UnitY();
+  SkeletonBuilder tree;
+  const int hips = tree.add("Hips", -1, trunk.hips, trunk.spine, forward);
+  const int spine = tree.add("Spine", hips, trunk.spine, trunk.spine1, forward);
+  const int spine1 = tree.add("Spine1", spine, trunk.spine1, trunk.spine2, forward);
+  const int spine2 = tree.add("Spine2", spine1, trunk.spine2, trunk.neck, forward);
+  const int neck = tree.add("Neck", spine2, trunk.neck, trunk.head, forward);
+  const int head = tree.add("Head", neck, trunk.head, trunk.crown, forward);
+  tree.add("HeadTop_End", head, trunk.crown, trunk.crown + (trunk.crown - trunk.head), forward);
+  for (const size_t side : {left, right}) {
+    const std::string prefix = side == left ? "Left" : "Right";
+    const ArmJoints& arm = arms[side];
+    const int clavicle = tree.add(prefix + "Shoulder", spine2, arm.clavicle, arm.shoulder, forward);
+    const int upper = tree.add(prefix + "Arm", clavicle, arm.shoulder, arm.elbow, forward);
+    const int lower = tree.add(prefix + "ForeArm", upper, arm.elbow, arm.wrist, forward);
+    tree.add(prefix + "Hand", lower, arm.wrist, arm.fingers, forward);
+  }
+  for (const size_t side : {left, right}) {
+    const std::string prefix = side == left ? "Left" : "Right";
+    const LegJoints& leg = legs[side];
+    const int upper = tree.add(prefix + "UpLeg", hips, leg.hip, leg.knee, forward);
+    const int lower = tree.add(prefix + "Leg", upper, leg.knee, leg.ankle, forward);
+    const int foot = tree.add(prefix + "Foot", lower, leg.ankle, leg.ball, up);
+    tree.add(prefix + "ToeBase", foot, leg.ball, leg.toes, up);
+  }
+  return tree.take();
+}
+
+}  // namespace
+
+Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& options, const Work& work) {
+  if (options.cells < 100 || options.cells > 400)
+    return Error{ErrorCode::invalid_argument,
+                 "skeleton.cells: " + std::to_string(options.cells) + ", expected 100 … 400"};
+  if (const auto checked = check(mesh); !checked) return checked.error();
+  auto measured = measure(mesh, options);
+  if (!measured) return measured.error();
+  Body body = std::move(measured).value();
+  if (work.stopped()) return Work::cancelled();
+
+  const auto core = find_core(body);
+  if (!core) return not_riggable("the shape is empty at the height of a trunk");
+  body.from_core = geodesics_from(body.interior, *core);
+  const auto share_steps = [&](double share) {
+    return static_cast<uint32_t>(10 * share * body.stature / body.voxel());
+  };
+  const auto ends = classify(body, find_extremities(body.interior, body.from_core, share_steps(0.04)));
+  if (!ends) return ends.error();
+  const bool hands = ends->hand[left] && ends->hand[right], feet = ends->foot[left].has_value();
+  if (!hands && !feet) return not_riggable("neither two arms nor two legs stand out from the shape");
+  if (work.stopped()) return Work::cancelled();
+
+  FittedSkeleton result;
+  std::vector<size_t> tips{ends->head};
+  std::array<std::optional<size_t>, 2> arm_limb, leg_limb;
+  for (const size_t side : {left, right}) {
+    if (ends->hand[side]) {
+      arm_limb[side] = tips.size();
+      tips.push_back(*ends->hand[side]);
+    }
+    if (ends->foot[side]) {
+      leg_limb[side] = tips.size();
+      tips.push_back(*ends->foot[side]);
+    }
+  }
+  const auto limbs = limbs_of(body.interior, body.from_core, tips);
+
+  // Legs up to the crotch, and with it the height of the hips.
+  std::array<std::vector<Vector3d>, 2> rows;
+  std::optional<double> crotch;
+  double hip_x = body.interior.point(ends->head).x();
+  if (feet) {
+    for (const size_t side : {left, right}) rows[side] = leg_rows(body, limbs[*leg_limb[side]], body.height(0.6));
+    crotch = where_legs_meet(body, rows[left], rows[right]);
+    for (const size_t side : {left, right})
+      std::erase_if(rows[side], [&](const Vector3d& p) { return p.y() > *crotch - 0.02 * body.stature; });
+  }
+  const double head_x = body.interior.point(ends->head).x();
+  const NeckMeasure neck = find_neck(body, head_x);
+  if (!neck.seen) result.warnings.emplace_back("no neck was seen (long hair or a hood?); it was placed by proportions");
+  const double hip_y = hip_height(body, neck, crotch, result.warnings);
+  if (const Run run = run_at(body, hip_y, hip_x); !run.empty()) {
+    // The trunk's middle; arms that touch it there are cut off at what hips measure.
+    const double half = 0.14 * body.stature;
+    hip_x = 0.5 * (std::max(run.low, hip_x - half) + std::min(run.high, hip_x + half));
+  }
+  TrunkJoints trunk = place_trunk(body, *ends, neck, hip_y, hip_x);
+
+  std::array<LegJoints, 2> legs;
+  if (!feet)
+    result.warnings.emplace_back("the legs cannot be told apart (a long skirt?); they were placed by proportions");
+  for (const size_t side : {left, right}) {
+    LegJoints& leg = legs[side];
+    const double ankle_y = body.height(ankle_height_share);
+    const Vector3d usual_hip(hip_x + sign(side) * hip_half_share * body.stature, hip_y, trunk.hips.z());
+    const auto ankle = feet ? extrapolate(rows[side], body.height(0.08), body.height(0.14), ankle_y) : std::nullopt;
+    leg.ankle = ankle.value_or(Vector3d(usual_hip.x(), ankle_y, usual_hip.z()));
+    const double knee_y = ankle_y + knee_of_leg * (hip_y - ankle_y);
+    const auto axis = feet ? extrapolate(rows[side], knee_y, body.height(1), hip_y) : std::nullopt;
+    leg.hip = usual_hip;
+    if (axis) leg.hip.x() = 0.5 * (usual_hip.x() + axis->x());
+    leg.hip.z() = 0.5 * (trunk.hips.z() + leg.ankle.z());
+    const double near = 0.02 * body.stature;
+    const auto bend = feet ? extrapolate(rows[side], knee_y - near, knee_y + near, knee_y) : std::nullopt;
+    leg.knee = bend.value_or(leg.ankle + knee_of_leg * (leg.hip - leg.ankle));
+    add_foot(body, feet ? limbs[*leg_limb[side]] : std::vector<uint32_t>(), leg);
+  }
+  trunk.hips.z() = std::min(trunk.hips.z(), 0.5 * (legs[left].hip.z() + legs[right].hip.z()));
+
+  std::array<ArmJoints, 2> arms;
+  const std::vector<double> outline = outline_from_above(body);
+  for (const size_t side : {left, right}) {
+    ArmJoints& arm = arms[side];
+    const double lowest = body.height(0.66);
+    if (arm_limb[side]) {
+      arm = trace_arm(body, limbs[*arm_limb[side]], outline, trunk.neck.x(), side, lowest, trunk, result.warnings);
+    } else {
+      arm = hanging_arm(body, outline, trunk.neck.x(), side, lowest, trunk);
+      result.warnings.push_back(std::string("the ") + name(side) +
+                                " arm cannot be told from the trunk; it was placed by proportions");
+    }
+    arm.clavicle = {trunk.neck.x() + sign(side) * 0.018 * body.stature,
+                    arm.shoulder.y() + 0.3 * (trunk.neck.y() - arm.shoulder.y()),
+                    0.5 * (trunk.neck.z() + arm.shoulder.z())};
+  }
+
+  for (Vector3d* p : {&trunk.hips, &trunk.spine, &trunk.spine1, &trunk.spine2, &trunk.neck, &trunk.head, &trunk.crown})
+    *p = pulled_inside(body, *p);
+  for (const size_t side : {left, right}) {
+    for (Vector3d* p : {&arms[side].clavicle, &arms[side].shoulder, &arms[side].elbow, &arms[side].wrist})
+      *p = pulled_inside(body, *p);
+    for (Vector3d* p : {&legs[side].hip, &legs[side].knee, &legs[side].ankle, &legs[side].ball})
+      *p = pulled_inside(body, *p);
+  }
+  result.skeleton = build(trunk, arms, legs);
+  work.report(1);
+  return result;
+}
+
+}  // namespace booth
