@@ -19,6 +19,8 @@ std::string_view to_string(ErrorCode code) {
     case ErrorCode::busy: return "busy";
     case ErrorCode::invalid_state: return "invalid_state";
     case ErrorCode::unsupported: return "unsupported";
+    case ErrorCode::not_calibrated: return "not_calibrated";
+    case ErrorCode::not_ready: return "not_ready";
     case ErrorCode::internal: return "internal";
   }
   return "internal";

@@ -27,6 +27,8 @@ enum class ErrorCode {
   busy,              ///< something exclusive is under way
   invalid_state,     ///< asked for at the wrong moment
   unsupported,       ///< not offered by this build or this rig
+  not_calibrated,    ///< the booth has no rig
+  not_ready,         ///< the booth cannot do that now, for reasons that the message names
   internal           ///< a bug
 };
 
