@@ -65,7 +65,7 @@ struct BoothConfig {
   JobsConfig jobs;
   LogConfig log;
   DriversConfig drivers;
-  ReplayOptions replay{.recording = "/usr/share/avatar-booth/recordings/mini"};
+  ReplayOptions replay;
   ReconstructionOptions reconstruct;
 };
 

@@ -19,7 +19,7 @@ struct ReplayFault {
     lost      ///< the camera is gone at that trigger, and can be opened again after delay_ms (0: never)
   };
   Kind kind = Kind::missing;
-  std::string camera;                 ///< id; empty: every camera
+  std::string camera = {};            ///< id; empty: every camera
   std::optional<ShotRole> role = {};  ///< nothing: every role
   std::optional<int> index = {};      ///< trigger within the shot, from 0; nothing: each
   std::optional<int> capture = {};    ///< how often the camera was armed for the role before, from 0; nothing: always
@@ -32,9 +32,9 @@ struct ReplayOptions {
     real,  ///< frames arrive as a camera's would: after exposure, offset and transfer; patterns take their time
     fast   ///< at once
   };
-  std::filesystem::path recording;
+  std::filesystem::path recording = "/usr/share/avatar-booth/recordings/mini";
   Pace pace = Pace::real;
-  std::vector<ReplayFault> faults;
+  std::vector<ReplayFault> faults = {};
   size_t cache_mib = 128;  ///< decoded frames that are kept for the next capture
 };
 
