@@ -17,9 +17,11 @@ namespace {
 /// no single cell may outvote its whole neighbourhood.
 constexpr float background_evidence = 4;
 constexpr float largest_evidence = 12;
+/// Beyond this a cell is subject whatever its neighbours say, but for noise.
+constexpr float clear_subject = 3;
 /// What a cell says that is darker than the background by what a soft shadow could take: next to nothing. Its
 /// boundary decides: shadows fade in, things have edges.
-constexpr float shadow_evidence = 0.05F;
+constexpr float shadow_evidence = -0.05F;
 /// Bounced light tints the background by this much (lightness differences between channels), shadows by more.
 constexpr float tint = 0.02F;
 constexpr float tint_in_shadow = 0.08F;
@@ -27,6 +29,13 @@ constexpr float tint_in_shadow = 0.08F;
 constexpr float brightening = 0.025F;
 /// A loss of lightness up to this is not even noticed.
 constexpr float unnoticed_shadow = 0.03F;
+
+/// How exactly shadows and drift keep the background's texture, in lightness.
+constexpr float kept_texture = 0.012F;
+/// A roughness up to this is noise; beyond, it speaks for subject, so much per unit and so much at most.
+constexpr float noisy_roughness = 3;
+constexpr float roughness_evidence = 1.5F;
+constexpr float largest_roughness_evidence = 6;
 
 /// Differences of lightness between neighbours beyond noise that count as an edge.
 constexpr float edge_lightness = 0.04F;
@@ -78,6 +87,59 @@ class Evidence {
   bool colored_;
 };
 
+/// How much rougher than noise a cell's surroundings are in the difference to the background, 1 for noise alone.
+/// Shadows keep the background's texture, so that nothing of it is left in the difference; whoever stands before it
+/// brings a texture of their own. What counts is the twist a − b − c + d of 2 × 2 cells, as it is blind to the
+/// gradients of soft shadows. Squares that hold a cell which is clearly subject are left out, and of the four 3 × 3
+/// windows with the cell at a corner the smoothest counts: neither looks across the subject's outline.
+std::vector<float> roughness(const Residual& residual, const CellGrid& grid, const std::vector<float>& evidence) {
+  const int channels = residual.difference.channels;
+  const auto width = static_cast<size_t>(grid.width);
+  std::vector<float> twist(grid.count(), 0), used(grid.count(), 0), window(grid.count(), 0), rough(grid.count(), 0);
+  for (int c = 0; c < channels; ++c) {
+    for (int y = 0; y + 1 < grid.height; ++y) {
+      const float* here = residual.difference.values[c].data() + grid.index(0, y);
+      const float* below = here + width;
+      const float* variance = residual.variance.values[c].data() + grid.index(0, y);
+      float* out = twist.data() + grid.index(0, y);
+      for (int x = 0; x + 1 < grid.width; ++x) {
+        const float t = here[x] - here[x + 1] - below[x] + below[x + 1];
+        out[x] += t * t / (variance[x] + kept_texture * kept_texture);
+      }
+    }
+  }
+  for (int y = 0; y + 1 < grid.height; ++y) {
+    const float* here = evidence.data() + grid.index(0, y);
+    const float* below = here + width;
+    for (int x = 0; x + 1 < grid.width; ++x) {
+      const float most = std::max(std::max(here[x], here[x + 1]), std::max(below[x], below[x + 1]));
+      used[grid.index(x, y)] = most < clear_subject ? 1.0F : 0.0F;
+      twist[grid.index(x, y)] *= used[grid.index(x, y)];
+    }
+  }
+  // window (x, y) covers the cells x … x + 2, y … y + 2.
+  const float scale = 1.0F / static_cast<float>(4 * channels);
+  for (int y = 0; y + 2 < grid.height; ++y) {
+    const float* t = twist.data() + grid.index(0, y);
+    const float* n = used.data() + grid.index(0, y);
+    float* out = window.data() + grid.index(0, y);
+    for (int x = 0; x + 2 < grid.width; ++x) {
+      const float sum = t[x] + t[x + 1] + t[x + width] + t[x + width + 1];
+      const float count = n[x] + n[x + 1] + n[x + width] + n[x + width + 1];
+      out[x] = scale * sum / std::max(count, 1.0F);
+    }
+  }
+  for (int y = 2; y + 2 < grid.height; ++y) {
+    const float* up = window.data() + grid.index(0, y - 2);
+    const float* here = window.data() + grid.index(0, y);
+    float* out = rough.data() + grid.index(0, y);
+    for (int x = 2; x + 2 < grid.width; ++x) {
+      out[x] = std::min(std::min(up[x - 2], up[x]), std::min(here[x - 2], here[x]));
+    }
+  }
+  return rough;
+}
+
 /// What it costs to draw a boundary between two neighbouring cells.
 class BoundaryCost {
  public:
@@ -113,7 +175,6 @@ enum class Certainty : uint8_t { open, subject, background };
 std::vector<Certainty> certain_cells(const std::vector<float>& evidence, const CellGrid& grid) {
   // Runs of clear cells of ± reach in both axes, as an erosion in two passes.
   constexpr int reach = 2;
-  constexpr float clear_subject = 3;
   constexpr float clear_background = -2;
   std::vector<Certainty> clear(grid.count(), Certainty::open), rows(grid.count(), Certainty::open);
   for (size_t i = 0; i < clear.size(); ++i) {
@@ -255,6 +316,11 @@ Labeling label_cells(const CellGrid& grid, const Residual& residual, const Label
   const Evidence evidence_of(residual, options);
   std::vector<float> evidence(grid.count());
   for (size_t i = 0; i < evidence.size(); ++i) evidence[i] = evidence_of(i);
+  const std::vector<float> rough = roughness(residual, grid, evidence);
+  for (size_t i = 0; i < evidence.size(); ++i) {
+    const float texture = roughness_evidence * std::max(0.0F, rough[i] - noisy_roughness);
+    evidence[i] = std::min(evidence[i] + std::min(texture, largest_roughness_evidence), largest_evidence);
+  }
 
   Labeling labeling;
   labeling.subject = cut(evidence, residual, grid, options.smoothness);
