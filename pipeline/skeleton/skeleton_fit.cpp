@@ -8,7 +8,7 @@
 #include <optional>
 #include <utility>
 
-#include "pipeline/skeleton/interior.h"
+#include "pipeline/geometry/interior.h"
 
 namespace booth {
 namespace {
@@ -715,7 +715,7 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
 
   const auto core = find_core(body);
   if (!core) return not_riggable("the shape is empty at the height of a trunk");
-  body.from_core = geodesics_from(body.interior, *core);
+  body.from_core = geodesics_from(body.interior, std::array{GeodesicSource{*core, 0}});
   const auto share_steps = [&](double share) {
     return static_cast<uint32_t>(10 * share * body.stature / body.voxel());
   };

@@ -1,2 +1,299 @@
 #include "pipeline/skin/skinning.h"
-namespace booth { Result<Skin> compute_skin(const Mesh&, const Skeleton&, const SkinningOptions&, const Work&) { return Error{ErrorCode::unsupported, "pending"}; } }
+
+#include <Eigen/Geometry>
+#include <Eigen/Sparse>
+#include <Eigen/SparseCholesky>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "pipeline/geometry/interior.h"
+
+namespace booth {
+namespace {
+
+using Eigen::Vector3d;
+
+/// What moves with a joint: a straight piece of the body's inside.
+struct Bone {
+  Vector3d from, to;
+  size_t joint = 0;
+};
+
+bool ends_with(const std::string& text, const std::string& end) {
+  return text.size() >= end.size() && text.compare(text.size() - end.size(), end.size(), end) == 0;
+}
+
+/// How far the inside reaches from a joint along its +Y.
+double reach_inside(const Interior& interior, const Eigen::Isometry3d& joint) {
+  const double step = interior.grid.voxel_m;
+  double length = 0;
+  while (interior.depth(joint.translation() + (length + step) * joint.linear().col(1)) > 0) length += step;
+  return length;
+}
+
+std::vector<Bone> bones_of(const Skeleton& skeleton, const std::vector<Eigen::Isometry3d>& world,
+                           const Interior& interior) {
+  std::vector<Bone> bones;
+  std::vector<bool> has_child(skeleton.joints.size(), false);
+  for (size_t j = 0; j < skeleton.joints.size(); ++j) {
+    if (skeleton.joints[j].parent < 0) continue;
+    const size_t parent = static_cast<size_t>(skeleton.joints[j].parent);
+    has_child[parent] = true;
+    bones.push_back({world[parent].translation(), world[j].translation(), parent});
+  }
+  for (size_t j = 0; j < skeleton.joints.size(); ++j) {
+    if (has_child[j] || ends_with(skeleton.joints[j].name, "_End")) continue;
+    const Vector3d at = world[j].translation();
+    bones.push_back({at, at + reach_inside(interior, world[j]) * world[j].linear().col(1), j});
+  }
+  return bones;
+}
+
+/// A trunk is wider than deep: its bones get a copy to either side, as far out as hips and ribs go.
+void widen_trunk(const Skeleton& skeleton, const std::vector<Eigen::Isometry3d>& world, std::vector<Bone>& bones) {
+  constexpr double of_hips = 0.8, of_shoulders = 0.62;  // breadth of the column of bones, of that between the joints
+  const auto at = [&](const char* name) -> std::optional<Vector3d> {
+    const int joint = skeleton.find(name);
+    if (joint < 0) return std::nullopt;
+    return world[static_cast<size_t>(joint)].translation();
+  };
+  const auto hips = at("Hips"), neck = at("Neck"), left_hip = at("LeftUpLeg"), right_hip = at("RightUpLeg"),
+             left_arm = at("LeftArm"), right_arm = at("RightArm");
+  if (!hips || !neck || !left_hip || !right_hip || !left_arm || !right_arm) return;
+  const double rise = (*neck - *hips).norm();
+  const auto aside = [&](const Vector3d& p) -> Vector3d {
+    const double t = std::clamp((p - *hips).dot(*neck - *hips) / (rise * rise), 0.0, 1.0);
+    return 0.5 * ((1 - t) * of_hips * (*left_hip - *right_hip) + t * of_shoulders * (*left_arm - *right_arm));
+  };
+  std::vector<Bone> wide;
+  for (const char* name : {"Hips", "Spine", "Spine1", "Spine2"})
+    for (const Bone& bone : bones) {
+      if (static_cast<int>(bone.joint) != skeleton.find(name)) continue;
+      const bool along_trunk =
+          std::abs((bone.to - bone.from).dot(*neck - *hips)) > 0.5 * rise * (bone.to - bone.from).norm();
+      if (!along_trunk) continue;
+      // Below the neck, the ribs close in under the shoulders.
+      Vector3d to = bone.to;
+      if ((to - *neck).norm() < 1e-9) to = 0.5 * (bone.from + bone.to);
+      for (const double side : {1.0, -1.0})
+        wide.push_back({bone.from + side * aside(bone.from), to + side * aside(to), bone.joint});
+    }
+  bones.insert(bones.end(), wide.begin(), wide.end());
+}
+
+/// A vertex's bone and how far away that is.
+struct Attachment {
+  size_t joint = 0;
+  double distance_m = 0;
+};
+
+double distance_to_bone(const Bone& bone, const Vector3d& p) {
+  const Vector3d along = bone.to - bone.from;
+  const double length2 = along.squaredNorm();
+  const double t = length2 > 0 ? std::clamp((p - bone.from).dot(along) / length2, 0.0, 1.0) : 0;
+  return (p - bone.from - t * along).norm();
+}
+
+/// The voxel inside that is nearest to a point of the surface, at most two voxels away.
+std::optional<size_t> voxel_near(const Interior& interior, const Geodesics& geodesics, const Vector3d& p) {
+  const Grid& grid = interior.grid;
+  const Vector3d at = (p - grid.origin) / grid.voxel_m;
+  std::optional<size_t> best;
+  double nearest = std::numeric_limits<double>::infinity();
+  constexpr int reach = 2;
+  std::array<int, 3> low{}, high{};
+  for (size_t axis = 0; axis < 3; ++axis) {
+    const int middle =
+        static_cast<int>(std::lround(std::clamp(at[static_cast<int>(axis)], -10.0, grid.size[axis] + 10.0)));
+    low[axis] = std::max(0, middle - reach);
+    high[axis] = std::min(grid.size[axis] - 1, middle + reach);
+  }
+  for (int k = low[2]; k <= high[2]; ++k)
+    for (int j = low[1]; j <= high[1]; ++j)
+      for (int i = low[0]; i <= high[0]; ++i) {
+        const size_t voxel = interior.index(i, j, k);
+        const double distance = (Vector3d(i, j, k) - at).squaredNorm();
+        if (geodesics.steps[voxel] == Geodesics::unreached || distance >= nearest) continue;
+        nearest = distance;
+        best = voxel;
+      }
+  return best;
+}
+
+std::vector<Attachment> attach(const Mesh& mesh, const Interior& interior, const std::vector<Bone>& bones,
+                               const Work& work) {
+  // Ways start on the bones; where the limb is thick they have a lead, so that a thin limb beside a thick one does
+  // not win its skin.
+  std::vector<GeodesicSource> sources;
+  std::vector<size_t> bone_of;
+  const double voxel = interior.grid.voxel_m;
+  double deepest = 0;
+  std::vector<double> depth;
+  for (size_t b = 0; b < bones.size(); ++b) {
+    const double length = (bones[b].to - bones[b].from).norm();
+    const int pieces = std::max(1, static_cast<int>(std::ceil(length / voxel)));
+    for (int n = 0; n <= pieces; ++n) {
+      const Vector3d p = bones[b].from + static_cast<double>(n) / pieces * (bones[b].to - bones[b].from);
+      const Vector3d cell = (p - interior.grid.origin) / voxel;
+      const std::array<int, 3> at{static_cast<int>(std::lround(cell.x())), static_cast<int>(std::lround(cell.y())),
+                                  static_cast<int>(std::lround(cell.z()))};
+      bool on_grid = true;
+      for (size_t axis = 0; axis < 3; ++axis) on_grid = on_grid && at[axis] >= 0 && at[axis] < interior.grid.size[axis];
+      if (!on_grid) continue;
+      const size_t index = interior.index(at[0], at[1], at[2]);
+      sources.push_back({index, 0});
+      bone_of.push_back(b);
+      depth.push_back(static_cast<double>(interior.depth_m[index]));
+      deepest = std::max(deepest, depth.back());
+    }
+  }
+  for (size_t s = 0; s < sources.size(); ++s)
+    sources[s].start = static_cast<uint32_t>(std::lround(10 * (deepest - depth[s]) / voxel));
+  const Geodesics geodesics = geodesics_from(interior, sources);
+
+  std::vector<Attachment> attachments(mesh.positions.size());
+  work.parallel_for(attachments.size(), 1024, [&](size_t begin, size_t end) {
+    for (size_t v = begin; v < end; ++v) {
+      const Vector3d p = mesh.positions[v].cast<double>();
+      if (const auto at = voxel_near(interior, geodesics, p)) {
+        const size_t source = geodesics.origin[*at];
+        const double way = (geodesics.steps[*at] - sources[source].start) * voxel / 10;
+        attachments[v] = {bones[bone_of[source]].joint,
+                          std::max(way, (p - interior.point(sources[source].voxel)).norm())};
+        continue;
+      }
+      // A part of the mesh beside the body: the nearest bone as the crow flies.
+      double nearest = std::numeric_limits<double>::infinity();
+      for (const Bone& bone : bones)
+        if (const double distance = distance_to_bone(bone, p); distance < nearest) {
+          nearest = distance;
+          attachments[v] = {bone.joint, distance};
+        }
+    }
+  });
+  return attachments;
+}
+
+/// The stiffness matrix of the surface (cotangent weights, none negative) and the area around each vertex.
+struct Laplacian {
+  std::vector<Eigen::Triplet<double>> stiffness;
+  Eigen::VectorXd area;
+};
+
+Laplacian laplacian(const Mesh& mesh) {
+  Laplacian result;
+  result.area = Eigen::VectorXd::Zero(static_cast<Eigen::Index>(mesh.positions.size()));
+  result.stiffness.reserve(12 * mesh.triangles.size());
+  for (const auto& t : mesh.triangles) {
+    std::array<Vector3d, 3> p;
+    for (size_t c = 0; c < 3; ++c) p[c] = mesh.positions[t[c]].cast<double>();
+    const double twice_area = (p[1] - p[0]).cross(p[2] - p[0]).norm();
+    for (size_t c = 0; c < 3; ++c) {
+      const int a = static_cast<int>(t[(c + 1) % 3]), b = static_cast<int>(t[(c + 2) % 3]);
+      result.area[static_cast<int>(t[c])] += twice_area / 6;
+      // An obtuse corner would push heat from cold to warm, and weights out of 0 … 1.
+      constexpr double largest_cotangent = 50;
+      const double cotangent = std::clamp(
+          (p[(c + 1) % 3] - p[c]).dot(p[(c + 2) % 3] - p[c]) / std::max(twice_area, 1e-12), 0.0, largest_cotangent);
+      const double w = 0.5 * cotangent;
+      result.stiffness.emplace_back(a, a, w);
+      result.stiffness.emplace_back(b, b, w);
+      result.stiffness.emplace_back(a, b, -w);
+      result.stiffness.emplace_back(b, a, -w);
+    }
+  }
+  return result;
+}
+
+/// The four largest of a vertex's weights, without traces, as shares of their sum.
+JointInfluences strongest(const std::vector<float>& weights) {
+  constexpr float trace = 0.01F;
+  JointInfluences result;
+  std::array<std::pair<float, uint16_t>, 4> best{};
+  for (size_t j = 0; j < weights.size(); ++j) {
+    std::pair<float, uint16_t> entry(weights[j], static_cast<uint16_t>(j));
+    for (auto& place : best)
+      if (entry.first > place.first) std::swap(entry, place);
+  }
+  float sum = 0;
+  for (const auto& [weight, joint] : best)
+    if (weight >= trace * best[0].first) sum += weight;
+  for (size_t k = 0; k < best.size(); ++k) {
+    if (best[k].first < trace * best[0].first || !(best[k].first > 0)) continue;
+    result.joint[k] = best[k].second;
+    result.weight[k] = best[k].first / sum;
+  }
+  return result;
+}
+
+}  // namespace
+
+Result<Skin> compute_skin(const Mesh& mesh, const Skeleton& skeleton, const SkinningOptions& options,
+                          const Work& work) {
+  if (!(options.stiffness >= 0.1 && options.stiffness <= 10))
+    return Error{ErrorCode::invalid_argument,
+                 "skin.stiffness: " + std::to_string(options.stiffness) + ", expected 0.1 … 10"};
+  if (options.cells < 60 || options.cells > 400)
+    return Error{ErrorCode::invalid_argument, "skin.cells: " + std::to_string(options.cells) + ", expected 60 … 400"};
+  if (const auto checked = check(mesh); !checked) return checked.error();
+  if (const auto checked = check(skeleton); !checked) return checked.error();
+  if (mesh.triangles.empty()) return Error{ErrorCode::invalid_argument, "skin: the mesh is empty"};
+  if (skeleton.joints.size() > std::numeric_limits<uint16_t>::max())
+    return Error{ErrorCode::invalid_argument, "skin: too many joints"};
+
+  const std::vector<Eigen::Isometry3d> world = world_from_joints(skeleton);
+  const Interior interior = sample_interior(mesh, options.cells);
+  std::vector<Bone> bones = bones_of(skeleton, world, interior);
+  if (bones.empty()) return Error{ErrorCode::invalid_argument, "skin: the skeleton has no bones"};
+  widen_trunk(skeleton, world, bones);
+  const std::vector<Attachment> attachments = attach(mesh, interior, bones, work);
+  if (work.stopped()) return Work::cancelled();
+  work.report(0.3);
+
+  // (−Δ + H) w = H p, with H = stiffness / distance² and p one where the joint is the vertex's own.
+  const Eigen::Index vertices = static_cast<Eigen::Index>(mesh.positions.size());
+  Laplacian heat = laplacian(mesh);
+  Eigen::VectorXd warmth(vertices);
+  constexpr double least_distance_m = 0.005;
+  constexpr double least_area_m2 = 1e-9;  // a vertex without triangles keeps its own joint
+  for (Eigen::Index v = 0; v < vertices; ++v) {
+    const double d = std::max(attachments[static_cast<size_t>(v)].distance_m, least_distance_m);
+    warmth[v] = options.stiffness * std::max(heat.area[v], least_area_m2) / (d * d);
+    heat.stiffness.emplace_back(static_cast<int>(v), static_cast<int>(v), warmth[v]);
+  }
+  Eigen::SparseMatrix<double> matrix(vertices, vertices);
+  matrix.setFromTriplets(heat.stiffness.begin(), heat.stiffness.end());
+  const Eigen::SimplicialLDLT<Eigen::SparseMatrix<double>> solver(matrix);
+  if (solver.info() != Eigen::Success) return Error{ErrorCode::internal, "skin: the heat equation could not be solved"};
+  if (work.stopped()) return Work::cancelled();
+  work.report(0.6);
+
+  std::vector<Eigen::VectorXd> shares(skeleton.joints.size());
+  work.parallel_for(shares.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t j = begin; j < end; ++j) {
+      Eigen::VectorXd source = Eigen::VectorXd::Zero(vertices);
+      for (Eigen::Index v = 0; v < vertices; ++v)
+        if (attachments[static_cast<size_t>(v)].joint == j) source[v] = warmth[v];
+      if (source.any()) shares[j] = solver.solve(source);
+    }
+  });
+  Skin skin;
+  skin.influences.resize(mesh.positions.size());
+  work.parallel_for(skin.influences.size(), 1024, [&](size_t begin, size_t end) {
+    std::vector<float> weights(skeleton.joints.size());
+    for (size_t v = begin; v < end; ++v) {
+      for (size_t j = 0; j < weights.size(); ++j)
+        weights[j] = shares[j].size() > 0 ? static_cast<float>(shares[j][static_cast<Eigen::Index>(v)]) : 0.0F;
+      skin.influences[v] = strongest(weights);
+    }
+  });
+  work.report(1);
+  return skin;
+}
+
+}  // namespace booth

@@ -4,6 +4,7 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <span>
 #include <vector>
 
 #include "pipeline/types/field.h"
@@ -37,12 +38,22 @@ struct Interior {
 /// functions", Theory of Computing 8, 2012.
 Interior sample_interior(const Mesh& mesh, int cells);
 
-/// Shortest ways inside the body, over the 26 neighbours of a voxel.
+/// Shortest ways inside the body, over the 26 neighbours of a voxel. By voxel index:
 struct Geodesics {
   static constexpr uint32_t unreached = UINT32_MAX;
-  std::vector<uint32_t> steps;  ///< by voxel index; tenths of a voxel, at most 12 % longer than the true way
+  std::vector<uint32_t> steps;   ///< tenths of a voxel from the nearest source; at most 12 % longer than the true way
+  std::vector<uint32_t> origin;  ///< which source that is; ties go to the one that was there first
 };
-Geodesics geodesics_from(const Interior& interior, size_t source);
+
+/// Where ways begin, with a lead or lag: `start` tenths of a voxel are added to every way from there.
+struct GeodesicSource {
+  size_t voxel = 0;
+  uint32_t start = 0;
+};
+
+/// @param sources  inside the body; others are ignored
+/// Source: R. Dial, "Algorithm 360: shortest-path forest with topological ordering", CACM 12(11), 1969.
+Geodesics geodesics_from(const Interior& interior, std::span<const GeodesicSource> sources);
 
 /// A part of the body that sticks out: a voxel farther from the core than all around it.
 struct Extremity {

@@ -1,4 +1,4 @@
-#include "pipeline/skeleton/interior.h"
+#include "pipeline/geometry/interior.h"
 
 #include <Eigen/Geometry>
 #include <algorithm>
@@ -263,27 +263,29 @@ Interior sample_interior(const Mesh& mesh, int cells) {
   return interior;
 }
 
-Geodesics geodesics_from(const Interior& interior, size_t source) {
+Geodesics geodesics_from(const Interior& interior, std::span<const GeodesicSource> sources) {
   const Neighbours neighbours(interior);
   Geodesics result;
   result.steps.assign(interior.depth_m.size(), Geodesics::unreached);
-  // Dial's buckets: no step is longer than 17, so 18 buckets in a ring hold all open voxels.
-  std::array<std::vector<uint32_t>, 18> ring;
-  result.steps[source] = 0;
-  ring[0].push_back(static_cast<uint32_t>(source));
+  result.origin.assign(interior.depth_m.size(), 0);
+  // A ring of buckets: longer than the longest step and the latest start, so that no two distances share a bucket.
+  uint32_t latest = 0;
+  for (const GeodesicSource& source : sources) latest = std::max(latest, source.start);
+  std::vector<std::vector<uint32_t>> ring(latest + 18);
+  const auto reach = [&](size_t voxel, uint32_t steps, uint32_t origin) {
+    if (interior.depth_m[voxel] <= 0 || steps >= result.steps[voxel]) return;
+    result.steps[voxel] = steps;
+    result.origin[voxel] = origin;
+    ring[steps % ring.size()].push_back(static_cast<uint32_t>(voxel));
+  };
+  for (size_t s = 0; s < sources.size(); ++s) reach(sources[s].voxel, sources[s].start, static_cast<uint32_t>(s));
   for (uint32_t now = 0, idle = 0; idle < ring.size(); ++now) {
     std::vector<uint32_t>& bucket = ring[now % ring.size()];
     idle = bucket.empty() ? idle + 1 : 0;
-    for (size_t n = 0; n < bucket.size(); ++n) {
-      const uint32_t at = bucket[n];
+    for (const uint32_t at : bucket) {
       if (result.steps[at] != now) continue;
-      for (size_t s = 0; s < neighbours.offset.size(); ++s) {
-        const size_t to = at + static_cast<size_t>(neighbours.offset[s]);
-        const uint32_t steps = now + neighbours.steps[s];
-        if (interior.depth_m[to] <= 0 || steps >= result.steps[to]) continue;
-        result.steps[to] = steps;
-        ring[steps % ring.size()].push_back(static_cast<uint32_t>(to));
-      }
+      for (size_t n = 0; n < neighbours.offset.size(); ++n)
+        reach(at + static_cast<size_t>(neighbours.offset[n]), now + neighbours.steps[n], result.origin[at]);
     }
     bucket.clear();
   }
