@@ -26,8 +26,8 @@ constexpr float band_px = 3.5F;
 constexpr float doubtful_contrast = 0.015F;
 /// Deviations, as shares of the background's light, that are half way from noise, bounced light and bleeding colours
 /// to a surface of its own.
-constexpr float strange_lightness = 0.08F;
-constexpr float strange_hue = 0.15F;
+constexpr float strange_lightness = 0.12F;
+constexpr float strange_hue = 0.25F;
 /// Keeps quotients of two black surfaces near 1.
 constexpr float dark = 2e-3F;
 
