@@ -139,7 +139,8 @@ std::vector<Lamp> light_dome(const Viewer& viewer) {
   return dome;
 }
 
-/// What every vertex receives from the lamps that it sees, about 0 … 1.2.
+/// What every vertex receives from the lamps that it sees, about 0 … 1.2. Nothing where it is turned away so far from
+/// the viewer that it can only be seen from inside.
 std::vector<float> light_at_vertices(const Mesh& mesh, const Viewer& viewer, const Work& work) {
   const std::vector<Lamp> dome = light_dome(viewer);
   const std::vector<Eigen::Vector3f> normals = vertex_normals(mesh);
@@ -148,6 +149,8 @@ std::vector<float> light_at_vertices(const Mesh& mesh, const Viewer& viewer, con
   constexpr size_t grain = 256;
   work.parallel_for(light.size(), grain, [&](size_t begin, size_t end) {
     for (size_t v = begin; v < end; ++v) {
+      constexpr float turned_away = -0.5F;  // cosine; triangles at the outline reach a little behind it
+      if (normals[v].dot((viewer.center.cast<float>() - mesh.positions[v]).normalized()) < turned_away) continue;
       constexpr float lift_m = 1e-3F;  // off the vertex's own triangles
       const Eigen::Vector3f origin = mesh.positions[v] + lift_m * normals[v];
       for (const Lamp& lamp : dome) {
@@ -240,17 +243,33 @@ void rasterise(const Picture& picture, uint32_t triangle, Band& band) {
   const int last_x = std::min(band.width - 1, static_cast<int>(std::floor(std::max({a.x, b.x, c.x}))));
   const float twice_area = (b.x - a.x) * (c.y - a.y) - (c.x - a.x) * (b.y - a.y);
   if (twice_area == 0) return;
-  for (int y = first_y; y <= last_y; ++y)
-    for (int x = first_x; x <= last_x; ++x) {
-      const float dx = static_cast<float>(x) - a.x, dy = static_cast<float>(y) - a.y;
-      const float second = (dx * (c.y - a.y) - (c.x - a.x) * dy) / twice_area;
-      const float third = ((b.x - a.x) * dy - dx * (b.y - a.y)) / twice_area;
+  // Barycentric coordinates grow evenly over the picture.
+  const float second_by_x = (c.y - a.y) / twice_area, second_by_y = (a.x - c.x) / twice_area;
+  const float third_by_x = (a.y - b.y) / twice_area, third_by_y = (b.x - a.x) / twice_area;
+  for (int y = first_y; y <= last_y; ++y) {
+    const float dy = static_cast<float>(y) - a.y;
+    // Where on the row all three coordinates are positive, a sample more on each side: the test below decides, so that
+    // no rounding opens a crack between neighbours.
+    float low = static_cast<float>(first_x), high = static_cast<float>(last_x);
+    const auto cut = [&](float at_a, float by_x) {
+      const float zero = a.x - at_a / by_x;
+      if (by_x > 0) low = std::max(low, zero - 1);
+      if (by_x < 0) high = std::min(high, zero + 1);
+    };
+    cut(dy * second_by_y, second_by_x);
+    cut(dy * third_by_y, third_by_x);
+    cut(1 - dy * (second_by_y + third_by_y), -second_by_x - third_by_x);
+    for (int x = static_cast<int>(std::ceil(low)); static_cast<float>(x) <= high; ++x) {
+      const float dx = static_cast<float>(x) - a.x;
+      const float second = dx * second_by_x + dy * second_by_y;
+      const float third = dx * third_by_x + dy * third_by_y;
       if (second < 0 || third < 0 || second + third > 1) continue;
       const float inverse_depth =
           a.inverse_depth + second * (b.inverse_depth - a.inverse_depth) + third * (c.inverse_depth - a.inverse_depth);
       if (Fragment& nearest = band.at(x, y); inverse_depth > nearest.inverse_depth)
         nearest = {inverse_depth, triangle, second, third};
     }
+  }
 }
 
 /// Linear light that leaves the surface at a fragment.
@@ -316,7 +335,7 @@ Image render_portrait(const Avatar& avatar, const PortraitOptions& options, cons
   const Viewer viewer = place_viewer(avatar.mesh, options);
   const Picture picture{avatar, options, project_vertices(avatar.mesh, viewer, options),
                         light_at_vertices(avatar.mesh, viewer, work), Texture(avatar.atlas.image)};
-  constexpr size_t rows_a_band = 16;
+  constexpr size_t rows_a_band = 8;
   work.parallel_for(static_cast<size_t>(options.height), rows_a_band, [&](size_t begin, size_t end) {
     render_rows(picture, static_cast<int>(begin), static_cast<int>(end), image);
   });

@@ -30,8 +30,9 @@ Result<ImageHeader> read_image_header(std::span<const uint8_t> bytes);
 ///                      with grey), or more than 100 million pixels
 Result<Image> decode_image(std::span<const uint8_t> bytes);
 
-/// @param image    1, 3 or 4 channels
-/// @param level    zlib's, 0 … 9
+/// @param image    1, 3 or 4 channels, not empty
+/// @param level    libdeflate's, 0 … 12: larger makes smaller files, slower
+/// Source: W3C, "Portable Network Graphics (PNG) Specification (Second Edition)", 2003.
 std::vector<uint8_t> encode_png(const Image& image, int level = 6);
 
 /// @param image    1 or 3 channels
