@@ -5,6 +5,7 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <numbers>
 #include <optional>
 #include <utility>
 
@@ -18,8 +19,9 @@ using Eigen::Vector3d;
 // Proportions of people, as shares of stature unless a comment says otherwise. Lengths between joint centres are the
 // means of de Leva's men and women; heights and breadths are Drillis and Contini's where they give them.
 constexpr double upper_arm_share = 0.150;   // shoulder to elbow; de Leva 0.160, less as stature here has shoes and hair
-constexpr double hand_of_arm = 0.25;        // wrist to fingertip, of shoulder to fingertip
+constexpr double hand_of_arm = 0.26;        // wrist to fingertip, of shoulder to fingertip
 constexpr double forearm_of_arm = 0.36;     // elbow to wrist, likewise
+constexpr double arm_share = 0.42;          // shoulder to fingertip
 constexpr double longest_arm_share = 0.48;  // what is longer holds something
 constexpr double shoulder_half_share = 0.105;   // middle to shoulder joint: half the biacromial breadth less 0.01
 constexpr double shoulder_cover_share = 0.031;  // shoulder joint to the skin above and beside it
@@ -291,13 +293,14 @@ std::vector<Station> centre_line(const Body& body, const std::vector<uint32_t>& 
 
 /// Cuts an arm's centre line where the section swells into the trunk.
 void cut_at_trunk(const Body& body, std::vector<Station>& line) {
-  const double wrist_at_least = 0.17 * body.stature;  // hands swell too, so look only beyond them
-  const double lookback = 0.06 * body.stature;
-  size_t back = 0;
+  const double forearm = 0.17 * body.stature, upper_arm = 0.27 * body.stature;  // from the fingertips
+  constexpr double swollen = 2;                                                 // of the widest section of the forearm
+  double widest = 0;
   for (size_t s = 0; s < line.size(); ++s) {
-    while (line[s].along - line[back].along > lookback) ++back;
-    if (line[s].along > wrist_at_least && line[s].area_m2 > 1.8 * line[back].area_m2 &&
-        line[back].along > 0.1 * body.stature) {
+    if (line[s].along < forearm) continue;
+    if (line[s].along < upper_arm) {
+      widest = std::max(widest, line[s].area_m2);
+    } else if (line[s].area_m2 > swollen * widest) {
       line.resize(s);
       break;
     }
@@ -317,24 +320,25 @@ std::vector<double> outline_from_above(const Body& body) {
 
 /// The shoulder joint lies under the outline of shoulder and arm as deep as the joint's cover: on the path of the
 /// centre of a ball rolled along the outline from within. Where on the path: by breadth and length of the upper arm.
-Vector3d shoulder_joint(const Body& body, const std::vector<double>& outline, double middle, size_t side, double lowest,
-                        double highest, const std::optional<Vector3d>& elbow, double depth_z) {
-  const double cover = shoulder_cover_share * body.stature;
+Vector3d shoulder_joint(const Body& body, const std::vector<double>& outline, double cover, double middle, size_t side,
+                        const TrunkJoints& trunk, const std::optional<Vector3d>& elbow) {
+  const double lowest = body.height(0.66), highest = trunk.neck.y();
+  const double depth_z = 0.5 * (trunk.neck.z() + trunk.spine2.z());
   const double voxel = body.voxel();
   const int reach = static_cast<int>(std::ceil(cover / voxel));
   double least = std::numeric_limits<double>::infinity();
-  Vector3d best(middle + sign(side) * shoulder_half_share * body.stature, lowest, depth_z);
+  Vector3d best(middle + sign(side) * shoulder_half_share * body.stature, body.height(0.8), depth_z);
   for (int i = reach; i + reach < static_cast<int>(outline.size()); ++i) {
     const double x = body.interior.grid.point(i, 0, 0).x();
     const double aside = sign(side) * (x - middle) / body.stature;
     if (aside < 0.06 || aside > 0.17) continue;
-    double y = std::numeric_limits<double>::infinity();
+    double y = highest;
     for (int o = -reach; o <= reach; ++o) {
       const double across = cover * cover - o * o * voxel * voxel;
       if (across >= 0) y = std::min(y, outline[static_cast<size_t>(i + o)] - std::sqrt(across));
     }
     if (!(y > lowest)) continue;
-    const Vector3d p(x, std::min(y, highest), depth_z);
+    const Vector3d p(x, y, depth_z);
     const auto squared = [](double v) { return v * v; };
     double cost = squared((aside - shoulder_half_share) / 0.012);
     if (elbow) cost += squared(((p - *elbow).norm() / body.stature - upper_arm_share) / 0.015);
@@ -343,6 +347,8 @@ Vector3d shoulder_joint(const Body& body, const std::vector<double>& outline, do
       best = p;
     }
   }
+  const double near = 0.02 * body.stature;
+  best.z() = centre_near(body, best, {near, near, body.stature}).z();
   return best;
 }
 
@@ -410,40 +416,58 @@ size_t elbow_station(const Body& body, const std::vector<Station>& line, double 
   return best;
 }
 
-/// The centre line continued straight to the shoulder.
-std::vector<Station> with_shoulder(const Body& body, std::vector<Station> line, const Vector3d& shoulder) {
+/// The centre line continued straight to a point.
+void continue_to(const Body& body, const Vector3d& to, std::vector<Station>& line) {
   const Vector3d from = line.back().p;
-  const double gap = (shoulder - from).norm();
+  const double gap = (to - from).norm(), start = line.back().along;
   const int pieces = std::max(1, static_cast<int>(std::lround(gap / (2.5 * body.voxel()))));
-  const double start = line.back().along;
   for (int n = 1; n <= pieces; ++n) {
     const double t = static_cast<double>(n) / pieces;
-    line.push_back({from + t * (shoulder - from), start + t * gap, 0});
+    line.push_back({from + t * (to - from), start + t * gap, 0});
   }
-  return line;
+}
+
+/// Where an arm meets the trunk before its elbow, its forearm is continued to where the elbow should be.
+void continue_to_elbow(const Body& body, std::vector<Station>& line) {
+  const double missing = (hand_of_arm + forearm_of_arm) * arm_share * body.stature - line.back().along;
+  if (missing <= 0) return;
+  const Vector3d before = point_along(line, line.back().along - 0.06 * body.stature);
+  const Vector3d direction = line.back().p - before;
+  if (!(direction.norm() > 0)) return;
+  continue_to(body, line.back().p + missing * direction.normalized(), line);
+}
+
+/// How deep the shoulder joint lies: usual for the stature, more under strong arms and thick sleeves.
+double shoulder_cover(const Body& body, const std::vector<Station>& line) {
+  const double usual = shoulder_cover_share * body.stature;
+  std::vector<double> areas;
+  for (const Station& s : line)
+    if (s.along > 0.24 * body.stature && s.area_m2 > 0) areas.push_back(s.area_m2);
+  if (areas.empty()) return usual;
+  std::nth_element(areas.begin(), areas.begin() + static_cast<std::ptrdiff_t>(areas.size() / 2), areas.end());
+  const double radius = std::sqrt(areas[areas.size() / 2] / std::numbers::pi);
+  return 0.5 * usual + 0.5 * std::clamp(radius, 0.015 * body.stature, 0.055 * body.stature);
 }
 
 ArmJoints trace_arm(const Body& body, const std::vector<uint32_t>& limb, const std::vector<double>& outline,
-                    double middle, size_t side, double lowest_shoulder, const TrunkJoints& trunk,
-                    std::vector<std::string>& warnings) {
+                    double middle, size_t side, const TrunkJoints& trunk, std::vector<std::string>& warnings) {
   std::vector<Station> line = centre_line(body, limb);
   cut_at_trunk(body, line);
-  const double shoulder_z = 0.5 * (trunk.neck.z() + trunk.spine2.z());
+  const double cover = shoulder_cover(body, line);
+  continue_to_elbow(body, line);
   ArmJoints arm;
   arm.fingers = body.interior.point(limb.front());
   std::optional<Vector3d> elbow;
   constexpr int rounds = 2;  // the shoulder's place depends on the elbow's and the other way round
   for (int round = 0; round < rounds; ++round) {
-    arm.shoulder = shoulder_joint(body, outline, middle, side, lowest_shoulder, trunk.neck.y(), elbow, shoulder_z);
-    const double near = 0.02 * body.stature;
-    arm.shoulder.z() = centre_near(body, arm.shoulder, {near, near, body.stature}).z();
-    std::vector<Station> whole = with_shoulder(body, line, arm.shoulder);
-    if (const double excess = whole.back().along - longest_arm_share * body.stature; excess > 0) {
+    arm.shoulder = shoulder_joint(body, outline, cover, middle, side, trunk, elbow);
+    std::vector<Station> whole = line;
+    continue_to(body, arm.shoulder, whole);
+    if (whole.back().along > longest_arm_share * body.stature) {
       // Something is held: count the arm from the shoulder.
-      const double usual = 0.42 * body.stature, spare = whole.back().along - usual;
+      const double spare = whole.back().along - arm_share * body.stature;
       if (round == 0)
-        warnings.push_back(std::string("the ") + name(side) +
-                           " arm is too long; what it holds was left out by proportions");
+        warnings.push_back(std::string("the ") + name(side) + " arm is too long; what it holds was left out");
       std::erase_if(whole, [&](const Station& s) { return s.along < spare; });
       for (Station& s : whole) s.along -= spare;
       arm.fingers = whole.front().p;
@@ -458,21 +482,17 @@ ArmJoints trace_arm(const Body& body, const std::vector<uint32_t>& limb, const s
 
 /// An arm that cannot be told from the trunk: hanging straight down from the shoulder.
 ArmJoints hanging_arm(const Body& body, const std::vector<double>& outline, double middle, size_t side,
-                      double lowest_shoulder, const TrunkJoints& trunk) {
+                      const TrunkJoints& trunk) {
+  const double cover = shoulder_cover_share * body.stature;
   ArmJoints arm;
-  arm.shoulder = shoulder_joint(body, outline, middle, side, lowest_shoulder, trunk.neck.y(), std::nullopt,
-                                0.5 * (trunk.neck.z() + trunk.spine2.z()));
+  arm.shoulder = shoulder_joint(body, outline, cover, middle, side, trunk, std::nullopt);
   const double near = 0.02 * body.stature;
-  const double length = upper_arm_share / (1 - hand_of_arm - forearm_of_arm) * body.stature;
   const auto below = [&](double share) {
     // As far out as the body goes there, less what covers the bone.
-    const double y = arm.shoulder.y() - share * length;
+    const double y = arm.shoulder.y() - share * arm_share * body.stature;
     const Run run = run_at(body, y, middle);
-    Vector3d p(run.empty() ? arm.shoulder.x()
-                           : (side == left ? run.high : run.low) - sign(side) * shoulder_cover_share * body.stature,
-               y, arm.shoulder.z());
-    p.z() = centre_near(body, p, {near, near, body.stature}).z();
-    return p;
+    const double x = run.empty() ? arm.shoulder.x() : (side == left ? run.high : run.low) - sign(side) * cover;
+    return Vector3d(x, y, centre_near(body, {x, y, arm.shoulder.z()}, {near, near, body.stature}).z());
   };
   arm.elbow = below(1 - hand_of_arm - forearm_of_arm);
   arm.wrist = below(1 - hand_of_arm);
@@ -633,7 +653,7 @@ TrunkJoints place_trunk(const Body& body, const Ends& ends, const NeckMeasure& n
   const Vector3d throat = centre_near(body, {x_at(neck_y), neck_y, skull.z()}, {0.03 * h, 0.015 * h, h});
   trunk.neck = {0.5 * (throat.x() + x_at(neck_y)), neck_y,
                 0.5 * throat.z() + 0.25 * (trunk.spine2.z() + trunk.head.z())};
-  trunk.crown = {skull.x(), body.height(1) - 0.01 * h, body.interior.point(ends.head).z()};
+  trunk.crown = {skull.x(), body.height(1) - 0.01 * h, skull.z()};
   return trunk;
 }
 
@@ -786,11 +806,10 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
   const std::vector<double> outline = outline_from_above(body);
   for (const size_t side : {left, right}) {
     ArmJoints& arm = arms[side];
-    const double lowest = body.height(0.66);
     if (arm_limb[side]) {
-      arm = trace_arm(body, limbs[*arm_limb[side]], outline, trunk.neck.x(), side, lowest, trunk, result.warnings);
+      arm = trace_arm(body, limbs[*arm_limb[side]], outline, trunk.neck.x(), side, trunk, result.warnings);
     } else {
-      arm = hanging_arm(body, outline, trunk.neck.x(), side, lowest, trunk);
+      arm = hanging_arm(body, outline, trunk.neck.x(), side, trunk);
       result.warnings.push_back(std::string("the ") + name(side) +
                                 " arm cannot be told from the trunk; it was placed by proportions");
     }
