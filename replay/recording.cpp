@@ -340,7 +340,7 @@ Result<Recording> read_recording(const fs::path& folder) {
   if (!document->ok()) return document->error();
 
   const auto rig_text = read_recording_file(folder, rig_file, largest_json_bytes);
-  if (!rig_text) return Error{ErrorCode::invalid_file, rig_text.error().message};
+  if (!rig_text) return Error{ErrorCode::invalid_file, name + ": rig: " + rig_text.error().message};
   auto rig = read_rig_text(rig_file, *rig_text);
   if (!rig) return rig.error();
   recording.shots = read_shots(root.member("shots"), *rig);
