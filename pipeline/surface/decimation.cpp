@@ -133,9 +133,9 @@ class Decimation {
   }
 
   Mesh run(size_t budget) {
-    // Where every collapse left is refused, the mesh is asked once more with the guard against turned normals loosened.
-    for (const double least_cosine : {0.3, -0.5, -2.0}) {
-      least_cosine_ = least_cosine;
+    // Where every collapse left is refused, what is asked of the triangles around it is lowered.
+    for (const Guard& guard : {Guard{0.3, 0.02}, Guard{-0.3, 0.002}, Guard{-1, 1e-5}}) {
+      guard_ = guard;
       while (alive_ > budget) {
         const size_t before = alive_;
         queue_all();
@@ -147,6 +147,12 @@ class Decimation {
   }
 
  private:
+  /// What a collapse may do to the triangles that it moves.
+  struct Guard {
+    double least_cosine;  ///< between a triangle's normals before and after
+    double thinnest;      ///< twice the area over the longest side squared: 0.87 for equal sides, 0 for a needle
+  };
+
   uint32_t from(uint32_t half) const { return triangles_[half / 3][half % 3]; }
   uint32_t to(uint32_t half) const { return from(next(half)); }
   bool dead(uint32_t half) const { return triangles_[half / 3][0] == none; }
@@ -301,10 +307,9 @@ class Decimation {
       const Eigen::Vector3d to_p = p - target, to_r = r - target;
       const Eigen::Vector3d turned = to_p.cross(to_r);
       const double area = turned.norm();
-      // Twice the area over the longest side squared: 0.87 for equal sides, 0 for a needle.
-      constexpr double thinnest = 0.02;
       const double longest2 = std::max({to_p.squaredNorm(), to_r.squaredNorm(), (p - r).squaredNorm()});
-      if (!(area > thinnest * longest2) || turned.dot(normal) < least_cosine_ * area * normal.norm()) return false;
+      if (!(area > guard_.thinnest * longest2) || turned.dot(normal) < guard_.least_cosine * area * normal.norm())
+        return false;
     }
     return true;
   }
@@ -361,7 +366,7 @@ class Decimation {
   std::vector<bool> locked_;
   EdgeQueue queue_;
   size_t alive_ = 0;
-  double least_cosine_ = 0;
+  Guard guard_{};
   std::vector<uint32_t> ring_, moved_;
   std::vector<Spanned> fan_;
 };
