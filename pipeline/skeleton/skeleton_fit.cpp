@@ -30,11 +30,13 @@ constexpr double hip_height_share = 0.52;       // of adults
 constexpr double hip_of_crotch = 1.14;          // hip joints' height, of the crotch's
 constexpr double knee_of_leg = 0.51;            // ankle to knee, of ankle to hip
 constexpr double ankle_height_share = 0.043;
-constexpr double foot_share = 0.152;           // length of a foot
-constexpr double ball_of_foot = 0.72;          // ankle to the ball of the foot, of ankle to toe tip
-constexpr double neck_height_share = 0.875;    // narrowest part of the neck
-constexpr double adult_head_share = 0.12;      // narrowest part of the neck to the crown
-constexpr double spine_of_trunk_depth = 0.37;  // the column of vertebrae, from the back
+constexpr double foot_share = 0.152;            // length of a foot
+constexpr double ball_of_foot = 0.72;           // ankle to the ball of the foot, of ankle to toe tip
+constexpr double neck_height_share = 0.875;     // narrowest part of the neck
+constexpr double adult_head_share = 0.12;       // narrowest part of the neck to the crown
+constexpr double spine_of_trunk_depth = 0.37;   // the column of vertebrae, from the back
+constexpr double sacrum_of_trunk_depth = 0.25;  // where it stands on the pelvis
+constexpr double deepest_trunk_share = 0.18;    // what is deeper is a skirt's or a coat's
 
 enum Side { left = 0, right = 1 };
 double sign(size_t side) { return side == left ? 1 : -1; }
@@ -66,6 +68,7 @@ struct Ends {
 };
 
 struct TrunkJoints {
+  Vector3d pelvis;  // between the hip joints; not a joint itself
   Vector3d hips, spine, spine1, spine2, neck, head, crown;
 };
 struct ArmJoints {
@@ -214,13 +217,17 @@ std::optional<size_t> find_core(const Body& body) {
 Result<Ends> classify(const Body& body, const std::vector<Extremity>& extremities) {
   const double per_stature = 10 * body.stature / body.voxel();  // geodesic steps
   Ends ends;
-  std::optional<Extremity> head;
-  for (const Extremity& e : extremities) {
-    const double y = body.interior.point(e.tip).y();
-    if (y > body.height(0.85) && (!head || y > body.interior.point(head->tip).y())) head = e;
-  }
-  if (!head) return not_riggable("nothing stands out at the top as a head does");
-  ends.head = head->tip;
+  // The crown is an end of the shape unless hair reaches farther from the trunk; then it is the highest place.
+  std::optional<size_t> head;
+  for (const Extremity& e : extremities)
+    if (const double y = body.interior.point(e.tip).y();
+        y > body.height(0.85) && (!head || y > body.interior.point(*head).y()))
+      head = e.tip;
+  if (!head)
+    head = *std::max_element(body.interior.inside.begin(), body.interior.inside.end(), [&](uint32_t a, uint32_t b) {
+      return body.interior.cell(a)[1] < body.interior.cell(b)[1];
+    });
+  ends.head = *head;
 
   std::vector<Extremity> feet;
   for (const Extremity& e : extremities)
@@ -607,21 +614,25 @@ NeckMeasure find_neck(const Body& body, double x) {
 }
 
 /// Hip joints' height from the crotch, checked against stature and the size of the head: the smaller the person, the
-/// larger the head and the shorter the legs (children of three: head 0.18, hips 0.45 of stature; Snyder et al. 1977).
+/// larger the head and the shorter the legs (Snyder et al., "Anthropometry of infants, children and youths", 1977:
+/// heads of 0.18 and hips at 0.46 of stature at the age of three).
 double hip_height(const Body& body, const NeckMeasure& neck, std::optional<double> crotch,
                   std::vector<std::string>& warnings) {
   const double head_share = neck.seen ? 1 - (neck.y - body.floor) / body.stature : adult_head_share;
-  const double usual = std::clamp(hip_height_share - 1.2 * (head_share - adult_head_share), 0.42, 0.53);
+  const double usual = std::clamp(hip_height_share - (head_share - adult_head_share), 0.44, 0.53);
   if (!crotch) return body.height(usual);
-  const double measured = hip_of_crotch * (*crotch - body.floor) / body.stature;
-  if (std::abs(measured - usual) > 0.07) {
-    warnings.emplace_back(measured < usual ? "the legs are one down to " +
-                                                 std::to_string(std::lround(100 * (*crotch - body.floor))) +
-                                                 " cm (a skirt?); the hips were placed by proportions"
-                                           : "no crotch was found; the hips were placed by proportions");
+  const double crotch_height = *crotch - body.floor;
+  const double measured = hip_of_crotch * crotch_height / body.stature;
+  if (measured < usual - 0.06) {
+    warnings.emplace_back("the legs are one down to " + std::to_string(std::lround(100 * crotch_height)) +
+                          " cm (a skirt?); the hips were placed by proportions");
     return body.height(usual);
   }
-  return body.height(0.6 * measured + 0.4 * usual);
+  if (measured > 0.58) {
+    warnings.emplace_back("no crotch was found; the hips were placed by proportions");
+    return body.height(usual);
+  }
+  return body.height(0.7 * measured + 0.3 * usual);
 }
 
 TrunkJoints place_trunk(const Body& body, const Ends& ends, const NeckMeasure& neck, double hip_y, double hip_x) {
@@ -634,20 +645,22 @@ TrunkJoints place_trunk(const Body& body, const Ends& ends, const NeckMeasure& n
   const Vector3d skull =
       centre_near(body, {head_x, body.height(1) - 0.4 * head_height, 0.5 * (body.interior.point(ends.head).z())},
                   {0.08 * h, 0.25 * head_height, h});
-  const auto spine_at = [&](double y, double x) {
+  const auto spine_at = [&](double y, double x, double of_depth) {
     const Run run = depth_run(body, x, y, 0.02 * h, 0.015 * h);
-    const double z = run.empty() ? skull.z() : run.low + spine_of_trunk_depth * run.width();
+    const double depth = std::min(run.width(), deepest_trunk_share * h);
+    const double z = run.empty() ? skull.z() : 0.5 * (run.low + run.high) - (0.5 - of_depth) * depth;
     return Vector3d(x, y, z);
   };
   const double neck_y = neck.y - 0.25 * head_height;
   const auto x_at = [&](double y) { return hip_x + (skull.x() - hip_x) * (y - hip_y) / (skull.y() - hip_y); };
-  const auto trunk_at = [&](double share) {
+  const auto trunk_at = [&](double share, double of_depth = spine_of_trunk_depth) {
     const double y = hip_y + share * (neck_y - hip_y);
-    return spine_at(y, x_at(y));
+    return spine_at(y, x_at(y), of_depth);
   };
-  trunk.hips = trunk_at(0);
-  trunk.spine = trunk_at(0.08);
-  trunk.spine1 = trunk_at(0.32);
+  trunk.pelvis = trunk_at(0);
+  trunk.hips = trunk_at(0, sacrum_of_trunk_depth);
+  trunk.spine = trunk_at(0.06);
+  trunk.spine1 = trunk_at(0.30);
   trunk.spine2 = trunk_at(0.62);
   trunk.head = {skull.x(), neck.y + 0.22 * head_height, skull.z() - 0.01 * h};
   const Vector3d throat = centre_near(body, {x_at(neck_y), neck_y, skull.z()}, {0.03 * h, 0.015 * h, h});
@@ -787,20 +800,19 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
   for (const size_t side : {left, right}) {
     LegJoints& leg = legs[side];
     const double ankle_y = body.height(ankle_height_share);
-    const Vector3d usual_hip(hip_x + sign(side) * hip_half_share * body.stature, hip_y, trunk.hips.z());
+    const Vector3d usual_hip(hip_x + sign(side) * hip_half_share * body.stature, hip_y, trunk.pelvis.z());
     const auto ankle = feet ? extrapolate(rows[side], body.height(0.08), body.height(0.14), ankle_y) : std::nullopt;
     leg.ankle = ankle.value_or(Vector3d(usual_hip.x(), ankle_y, usual_hip.z()));
     const double knee_y = ankle_y + knee_of_leg * (hip_y - ankle_y);
     const auto axis = feet ? extrapolate(rows[side], knee_y, body.height(1), hip_y) : std::nullopt;
     leg.hip = usual_hip;
     if (axis) leg.hip.x() = 0.5 * (usual_hip.x() + axis->x());
-    leg.hip.z() = 0.5 * (trunk.hips.z() + leg.ankle.z());
+    leg.hip.z() = 0.5 * (trunk.pelvis.z() + leg.ankle.z());
     const double near = 0.02 * body.stature;
     const auto bend = feet ? extrapolate(rows[side], knee_y - near, knee_y + near, knee_y) : std::nullopt;
     leg.knee = bend.value_or(leg.ankle + knee_of_leg * (leg.hip - leg.ankle));
     add_foot(body, feet ? limbs[*leg_limb[side]] : std::vector<uint32_t>(), leg);
   }
-  trunk.hips.z() = std::min(trunk.hips.z(), 0.5 * (legs[left].hip.z() + legs[right].hip.z()));
 
   std::array<ArmJoints, 2> arms;
   const std::vector<double> outline = outline_from_above(body);
