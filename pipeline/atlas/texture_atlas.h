@@ -4,6 +4,8 @@
 #include <string>
 #include <vector>
 
+#include "pipeline/atlas/blending.h"
+#include "pipeline/atlas/input_preparation.h"
 #include "pipeline/types/avatar.h"
 #include "pipeline/types/frame.h"
 #include "pipeline/types/rig.h"
@@ -13,7 +15,11 @@
 namespace booth {
 
 struct AtlasOptions {
-  int size = 2048;  ///< width and height of the atlas, texels, 256 … 8192
+  int size = 2048;                                ///< width and height of the atlas, texels, 256 … 8192
+  int gutter_texels = 4;                          ///< least distance between charts, 0 … 32
+  Inpainting inpainting = Inpainting::push_pull;  ///< Telea's is the paper's
+  Blending blending = Blending::best_view;        ///< rating_mean is the paper's
+  bool balance_colours = true;                    ///< removes differences of gain and white balance between cameras
 };
 
 struct TextureAtlas {
@@ -25,10 +31,16 @@ struct TextureAtlas {
 
 /// One view-independent texture, blended from every camera that sees a texel.
 ///
+/// The surface is unfolded into charts without distortion and packed; every camera is rated at every vertex; texels
+/// blend the cameras' colours in linear light. Where no camera looks, colours spread over the surface; unused
+/// texels continue their surroundings, so that smaller mip levels do not bleed.
+///
 /// @param mesh         closed, world frame
-/// @param frames       at most one a camera, RGB, distorted pixels; cameras without a silhouette are not used
+/// @param frames       at most one a camera, grey or RGB, distorted pixels; cameras without a silhouette are not used
 /// @param silhouettes  of the same cameras
-/// @error too_few_views  no frame with a silhouette of a camera in the rig
+/// @error invalid_argument  an option out of its range, a mesh that fails its check or is empty
+/// @error too_few_views  no frame with a silhouette of a camera in the rig, or none that sees the surface
+/// @error cancelled
 /// Source: R. Pagés, D. Berjón, F. Morán, N. García, "Seamless, static multi-texturing of 3D meshes",
 /// Computer Graphics Forum 34(1), 2015.
 Result<TextureAtlas> build_texture_atlas(const Mesh& mesh, const Rig& rig, std::span<const Frame> frames,

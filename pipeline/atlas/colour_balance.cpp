@@ -1,0 +1,91 @@
+#include "pipeline/atlas/colour_balance.h"
+
+#include <Eigen/Cholesky>
+#include <algorithm>
+#include <cmath>
+
+#include "pipeline/atlas/view_sampling.h"
+
+namespace booth {
+namespace {
+
+/// Two cameras' logarithmic colours of the same vertex.
+struct Pair {
+  int one, other;
+  float weight;
+  Eigen::Array3f difference;  ///< log(one) − log(other)
+};
+
+std::vector<Pair> overlaps(std::span<const PreparedView> views, const CameraRatings& ratings) {
+  constexpr float good_share = 0.35F;                   // of the best camera's rating
+  constexpr float least_trust = 0.9F;                   // clear of outlines and depth steps
+  constexpr size_t level = 2;                           // blurred by four pixels: the surface is not exact
+  constexpr float darkest = 0.003F, brightest = 0.85F;  // noise below, clipping above
+  struct Sample {
+    int camera;
+    float rating;
+    Eigen::Array3f light;
+  };
+  std::vector<Pair> pairs;
+  std::vector<Sample> samples;
+  const size_t vertices = views.empty() ? 0 : views[0].projected.size();
+  for (size_t v = 0; v < vertices; ++v) {
+    const auto rating = ratings.vertex(v);
+    const float best = *std::max_element(rating.begin(), rating.end());
+    if (!(best > 0)) continue;
+    samples.clear();
+    for (size_t c = 0; c < views.size(); ++c) {
+      if (rating[c] < good_share * best) continue;
+      const Eigen::Vector3f& p = views[c].projected[v];
+      if (!(p.z() > 0)) continue;
+      const Trust trust = look_up(views[c], p.x(), p.y(), p.z());
+      if (trust.visible * trust.confidence < least_trust) continue;
+      const Eigen::Array3f light =
+          sample_level(views[c].colours, std::min(level, views[c].colours.size() - 1), p.x(), p.y());
+      if (light.minCoeff() < darkest || light.maxCoeff() > brightest) continue;
+      samples.push_back({static_cast<int>(c), rating[c] / best, light.log()});
+    }
+    for (size_t i = 0; i < samples.size(); ++i)
+      for (size_t j = i + 1; j < samples.size(); ++j)
+        pairs.push_back({samples[i].camera, samples[j].camera, std::sqrt(samples[i].rating * samples[j].rating),
+                         samples[i].light - samples[j].light});
+  }
+  return pairs;
+}
+
+}  // namespace
+
+std::vector<Eigen::Array3f> balance_colours(std::span<const PreparedView> views, const CameraRatings& ratings) {
+  const auto cameras = static_cast<Eigen::Index>(views.size());
+  const std::vector<Pair> pairs = overlaps(views, ratings);
+  std::vector<Eigen::Array3f> gains(views.size(), Eigen::Array3f::Ones());
+  constexpr int rounds = 8;
+  constexpr double scale = 0.08;  // log units: what disagrees by more is another surface or a highlight
+  constexpr double prior = 1.0;   // in observations: keeps cameras without overlap at 1
+  for (int channel = 0; channel < 3; ++channel) {
+    Eigen::VectorXd correction = Eigen::VectorXd::Zero(cameras);
+    for (int round = 0; round < rounds; ++round) {
+      Eigen::MatrixXd normal = prior * Eigen::MatrixXd::Identity(cameras, cameras);
+      Eigen::VectorXd right = Eigen::VectorXd::Zero(cameras);
+      for (const Pair& pair : pairs) {
+        const auto difference = static_cast<double>(pair.difference[channel]);
+        const double residual = difference + correction[pair.one] - correction[pair.other];
+        // The first round is plain: only then is it known what an outlier is.
+        const double robust = round == 0 ? 1 : 1 / (1 + residual * residual / (scale * scale));
+        const double weight = static_cast<double>(pair.weight) * robust;
+        normal(pair.one, pair.one) += weight;
+        normal(pair.other, pair.other) += weight;
+        normal(pair.one, pair.other) -= weight;
+        normal(pair.other, pair.one) -= weight;
+        right[pair.one] -= weight * difference;
+        right[pair.other] += weight * difference;
+      }
+      correction = normal.ldlt().solve(right);
+    }
+    for (Eigen::Index c = 0; c < cameras; ++c)
+      gains[static_cast<size_t>(c)][channel] = static_cast<float>(std::exp(correction[c]));
+  }
+  return gains;
+}
+
+}  // namespace booth

@@ -1,0 +1,21 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <span>
+#include <vector>
+
+#include "pipeline/atlas/camera_ratings.h"
+#include "pipeline/atlas/input_preparation.h"
+
+namespace booth {
+
+/// The factor for each camera and channel of linear light that makes overlapping views of the same surface agree:
+/// undoes differences of exposure, gain and white balance between cameras. The geometric mean over cameras is 1 per
+/// channel, for what all cameras have in common cannot be told from the subject. A camera that shares nothing with
+/// others keeps 1.
+///
+/// Method: robust least squares on the logarithms of blurred colours at the vertices, over all pairs of cameras
+/// that see a vertex well (iteratively reweighted, Cauchy weights).
+std::vector<Eigen::Array3f> balance_colours(std::span<const PreparedView> views, const CameraRatings& ratings);
+
+}  // namespace booth

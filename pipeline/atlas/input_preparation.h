@@ -1,0 +1,38 @@
+#pragma once
+
+#include <Eigen/Core>
+#include <vector>
+
+#include "pipeline/atlas/push_pull.h"
+#include "pipeline/types/frame.h"
+#include "pipeline/types/image.h"
+#include "pipeline/types/mesh.h"
+#include "pipeline/types/rig.h"
+#include "pipeline/types/silhouette.h"
+
+namespace booth {
+
+/// How pixels outside the subject are replaced by colours of the subject.
+enum class Inpainting {
+  push_pull,  ///< smooth, fast
+  telea       ///< A. Telea, "An image inpainting technique based on the fast marching method", JGT 9(1), 2004
+};
+
+/// What texturing needs of one camera, cropped to the subject. Pixel coordinates are relative to the crop.
+struct PreparedView {
+  const RigCamera* camera = nullptr;
+  /// Of each vertex: pixel x and y, and the depth along the optical axis in metres; a depth of 0 says that the
+  /// camera cannot see it (behind it, or too far off the axis).
+  std::vector<Eigen::Vector3f> projected;
+  Pyramid colours;        ///< sRGB; the rim and the outside of the subject hold colours of its inside
+  FloatImage depth;       ///< metres to the first surface, at half the resolution (level 1 of the pyramid); huge = none
+  Image confidence;       ///< like `depth`: 255 well inside, falling to 0 at outlines, depth steps and image borders
+  int left = 0, top = 0;  ///< of the crop in the image
+};
+
+/// @param frame  grey or RGB, the size of the camera's image; so is the silhouette
+/// @param rim_m  how far from outlines and depth steps colours are not trusted, for the error of the surface
+PreparedView prepare_view(const Mesh& mesh, const RigCamera& camera, const Frame& frame, const Silhouette& silhouette,
+                          double rim_m, Inpainting inpainting);
+
+}  // namespace booth

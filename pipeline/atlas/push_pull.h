@@ -1,0 +1,21 @@
+#pragma once
+
+#include <vector>
+
+#include "pipeline/types/image.h"
+
+namespace booth {
+
+/// An image and its halves, quarters, …: pixel (i, j) of level k covers 2^k × 2^k pixels of level 0, so its centre
+/// lies at ((i + 0.5) · 2^k − 0.5, …) there.
+using Pyramid = std::vector<Image>;
+
+/// Fills the pixels that are not valid from those that are, smoothly and from ever farther away, and returns all
+/// levels on the way; averages are taken in linear light.
+///
+/// @param image  3 channels
+/// @param valid  1 channel, the same size, not 0 where a pixel holds a colour; if it is 0 everywhere, all is grey
+/// Source: S. J. Gortler et al., "The Lumigraph", SIGGRAPH 1996, section 4.2 (pull-push).
+Pyramid push_pull(Image image, const Image& valid);
+
+}  // namespace booth
