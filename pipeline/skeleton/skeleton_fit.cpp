@@ -807,7 +807,7 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
     const auto axis = feet ? extrapolate(rows[side], knee_y, body.height(1), hip_y) : std::nullopt;
     leg.hip = usual_hip;
     if (axis) leg.hip.x() = 0.5 * (usual_hip.x() + axis->x());
-    leg.hip.z() = 0.5 * (trunk.pelvis.z() + leg.ankle.z());
+    leg.hip.z() = 0.7 * trunk.pelvis.z() + 0.3 * leg.ankle.z();
     const double near = 0.02 * body.stature;
     const auto bend = feet ? extrapolate(rows[side], knee_y - near, knee_y + near, knee_y) : std::nullopt;
     leg.knee = bend.value_or(leg.ankle + knee_of_leg * (leg.hip - leg.ankle));

@@ -54,36 +54,40 @@ std::vector<Bone> bones_of(const Skeleton& skeleton, const std::vector<Eigen::Is
   return bones;
 }
 
-/// A trunk is wider than deep: its bones get a copy to either side, as far out as hips and ribs go.
-void widen_trunk(const Skeleton& skeleton, const std::vector<Eigen::Isometry3d>& world, std::vector<Bone>& bones) {
+/// Where the trunk and the arms divide the chest: the ribs are wider than deep, so the bones of the trunk get a copy
+/// to either side, as far out as hips and ribs go; and what lies over the inner half of a clavicle goes with them.
+void shape_trunk(const Skeleton& skeleton, const std::vector<Eigen::Isometry3d>& world, std::vector<Bone>& bones) {
   constexpr double of_hips = 0.8, of_shoulders = 0.62;  // breadth of the column of bones, of that between the joints
-  const auto at = [&](const char* name) -> std::optional<Vector3d> {
+  constexpr double inner_clavicle = 0.5;
+  const auto joint_of = [&](const char* name) -> std::optional<Vector3d> {
     const int joint = skeleton.find(name);
     if (joint < 0) return std::nullopt;
     return world[static_cast<size_t>(joint)].translation();
   };
-  const auto hips = at("Hips"), neck = at("Neck"), left_hip = at("LeftUpLeg"), right_hip = at("RightUpLeg"),
-             left_arm = at("LeftArm"), right_arm = at("RightArm");
+  const auto hips = joint_of("Hips"), neck = joint_of("Neck"), left_hip = joint_of("LeftUpLeg"),
+             right_hip = joint_of("RightUpLeg"), left_arm = joint_of("LeftArm"), right_arm = joint_of("RightArm");
   if (!hips || !neck || !left_hip || !right_hip || !left_arm || !right_arm) return;
-  const double rise = (*neck - *hips).norm();
+  const Vector3d up = *neck - *hips;
   const auto aside = [&](const Vector3d& p) -> Vector3d {
-    const double t = std::clamp((p - *hips).dot(*neck - *hips) / (rise * rise), 0.0, 1.0);
+    const double t = std::clamp((p - *hips).dot(up) / up.squaredNorm(), 0.0, 1.0);
     return 0.5 * ((1 - t) * of_hips * (*left_hip - *right_hip) + t * of_shoulders * (*left_arm - *right_arm));
   };
-  std::vector<Bone> wide;
+  std::vector<Bone> ribs;
   for (const char* name : {"Hips", "Spine", "Spine1", "Spine2"})
     for (const Bone& bone : bones) {
-      if (static_cast<int>(bone.joint) != skeleton.find(name)) continue;
-      const bool along_trunk =
-          std::abs((bone.to - bone.from).dot(*neck - *hips)) > 0.5 * rise * (bone.to - bone.from).norm();
-      if (!along_trunk) continue;
-      // Below the neck, the ribs close in under the shoulders.
-      Vector3d to = bone.to;
-      if ((to - *neck).norm() < 1e-9) to = 0.5 * (bone.from + bone.to);
+      const Vector3d along = bone.to - bone.from;
+      constexpr double upright = 0.5;
+      if (static_cast<int>(bone.joint) != skeleton.find(name) || along.dot(up) < upright * along.norm() * up.norm())
+        continue;
+      // Below the neck the ribs close in under the shoulders.
+      const Vector3d to = bone.to == *neck ? Vector3d(0.5 * (bone.from + bone.to)) : bone.to;
       for (const double side : {1.0, -1.0})
-        wide.push_back({bone.from + side * aside(bone.from), to + side * aside(to), bone.joint});
+        ribs.push_back({bone.from + side * aside(bone.from), to + side * aside(to), bone.joint});
     }
-  bones.insert(bones.end(), wide.begin(), wide.end());
+  bones.insert(bones.end(), ribs.begin(), ribs.end());
+  for (Bone& bone : bones)
+    for (const char* name : {"LeftShoulder", "RightShoulder"})
+      if (static_cast<int>(bone.joint) == skeleton.find(name)) bone.from += inner_clavicle * (bone.to - bone.from);
 }
 
 /// A vertex's bone and how far away that is.
@@ -250,7 +254,7 @@ Result<Skin> compute_skin(const Mesh& mesh, const Skeleton& skeleton, const Skin
   const Interior interior = sample_interior(mesh, options.cells);
   std::vector<Bone> bones = bones_of(skeleton, world, interior);
   if (bones.empty()) return Error{ErrorCode::invalid_argument, "skin: the skeleton has no bones"};
-  widen_trunk(skeleton, world, bones);
+  shape_trunk(skeleton, world, bones);
   const std::vector<Attachment> attachments = attach(mesh, interior, bones, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.3);

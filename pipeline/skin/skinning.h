@@ -6,7 +6,7 @@
 namespace booth {
 
 struct SkinningOptions {
-  double stiffness = 1.0;  ///< how quickly a vertex takes its own bone's motion on, 0.1 … 10; lower blends wider
+  double stiffness = 3.0;  ///< how quickly a vertex takes its own bone's motion on, 0.1 … 10; lower blends wider
   int cells = 160;         ///< voxels along the height of the body, in which bones are assigned, 60 … 400
 };
 
