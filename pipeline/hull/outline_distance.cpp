@@ -158,50 +158,54 @@ void OutlineDistance::refine(const Image& coverage) {
       for (int x = std::max(0, tx - reach); x <= std::min(tiles_x_ - 1, tx + reach); ++x)
         if (holds_outline(x, y)) visit(x, y);
   };
-  std::vector<Segment> near;
+  Samples along_x, along_y;  // of the samples, from the tile's first
+  for (int j = 0; j < nodes; ++j)
+    for (int i = 0; i < nodes; ++i) {
+      along_x[static_cast<size_t>(j * nodes + i)] = static_cast<float>(i);
+      along_y[static_cast<size_t>(j * nodes + i)] = static_cast<float>(j);
+    }
+  std::vector<Segment> near;       // relative to the tile
+  std::vector<float> from_middle;  // their distances from its middle
+  constexpr float middle = 0.5F * tile;
   for (int ty = 0; ty < tiles_y_; ++ty)
     for (int tx = 0; tx < tiles_x_; ++tx) {
       bool wanted = false;
       for_each_near(tx, ty, 1, [&](int, int) { wanted = true; });
       if (!wanted) continue;
-      float farthest = 0;  // of the tile's corners
-      for (const auto& [i, j] : {std::array{0, 0}, std::array{1, 0}, std::array{0, 1}, std::array{1, 1}})
-        farthest =
-            std::max(farthest, std::abs(node_distance_[static_cast<size_t>(ty + j) * static_cast<size_t>(tiles_x_ + 1) +
-                                                       static_cast<size_t>(tx + i)]));
-      // Every sample is within half a diagonal of a corner and of the middle.
-      const float reach = farthest + 2 * half_tile_diagonal;
-      const auto middle_x = static_cast<float>(tx * tile) + 0.5F * tile;
-      const auto middle_y = static_cast<float>(ty * tile) + 0.5F * tile;
+      const auto left = static_cast<float>(tx * tile), top = static_cast<float>(ty * tile);
       near.clear();
+      from_middle.clear();
+      float nearest = std::numeric_limits<float>::max();
       for_each_near(tx, ty, 2, [&](int x, int y) {
         const auto index = static_cast<size_t>(y * tiles_x_ + x);
         for (size_t s = first_segment_[index]; s < first_segment_[index + 1]; ++s) {
           const Segment& piece = segments_[s];
-          const float dx = 0.5F * (piece.x0 + piece.x1) - middle_x, dy = 0.5F * (piece.y0 + piece.y1) - middle_y;
-          const float longest_half = 0.71F;
-          if (dx * dx + dy * dy < (reach + longest_half) * (reach + longest_half)) near.push_back(piece);
+          near.push_back({piece.x0 - left, piece.y0 - top, piece.x1 - left, piece.y1 - top});
+          const float dx = 0.5F * (near.back().x0 + near.back().x1) - middle;
+          const float dy = 0.5F * (near.back().y0 + near.back().y1) - middle;
+          from_middle.push_back(std::sqrt(dx * dx + dy * dy));
+          nearest = std::min(nearest, from_middle.back());
         }
       });
       samples_of_[static_cast<size_t>(ty * tiles_x_ + tx)] = static_cast<int32_t>(samples_.size());
       Samples& samples = samples_.emplace_back();
       samples.fill(std::numeric_limits<float>::max());
-      for (const Segment& piece : near) {
-        const float dx = piece.x1 - piece.x0, dy = piece.y1 - piece.y0;
+      // All samples are within half a diagonal of the middle; a piece is at most a pixel's diagonal long.
+      constexpr float longest_half = 0.71F;
+      const float farthest = nearest + 2 * half_tile_diagonal + longest_half;
+      for (size_t n = 0; n < near.size(); ++n) {
+        if (from_middle[n] > farthest) continue;
+        const auto [x0, y0, x1, y1] = near[n];
+        const float dx = x1 - x0, dy = y1 - y0;
         const float inverse = 1 / std::max(dx * dx + dy * dy, 1e-12F);
-        const float x0 = piece.x0 - static_cast<float>(tx * tile), y0 = piece.y0 - static_cast<float>(ty * tile);
-        for (int j = 0; j < nodes; ++j) {
-          const float py = static_cast<float>(j) - y0;
-          float* row = samples.data() + j * nodes;
-          for (int i = 0; i < nodes; ++i) {
-            const float px = static_cast<float>(i) - x0;
-            float share = (px * dx + py * dy) * inverse;
-            share = share > 0 ? share : 0;
-            share = share < 1 ? share : 1;
-            const float ex = px - share * dx, ey = py - share * dy;
-            const float distance2 = ex * ex + ey * ey;
-            row[i] = distance2 < row[i] ? distance2 : row[i];
-          }
+        for (size_t s = 0; s < samples.size(); ++s) {
+          const float px = along_x[s] - x0, py = along_y[s] - y0;
+          float share = (px * dx + py * dy) * inverse;
+          share = share > 0 ? share : 0;
+          share = share < 1 ? share : 1;
+          const float ex = px - share * dx, ey = py - share * dy;
+          const float distance2 = ex * ex + ey * ey;
+          samples[s] = distance2 < samples[s] ? distance2 : samples[s];
         }
       }
       for (int j = 0; j < nodes; ++j)

@@ -18,6 +18,7 @@ constexpr std::array<int, 3> stride{1, side, side* side};
 /// The connected parts of one stored block: a part's number for every sample.
 struct BlockParts {
   std::array<uint16_t, Field::samples_per_brick> part;
+  std::vector<uint16_t> inside_samples;  ///< by part; 0 for one outside
   uint16_t parts = 0;
 };
 
@@ -30,11 +31,12 @@ void label(const float* values, BlockParts& block) {
   for (int seed = 0; seed < samples_per_brick; ++seed) {
     if (block.part[static_cast<size_t>(seed)] != none) continue;
     const bool inside = values[seed] < 0;
-    size_t count = 0;
+    size_t count = 0, labelled = 0;
     waiting[count++] = static_cast<uint16_t>(seed);
     block.part[static_cast<size_t>(seed)] = block.parts;
     while (count > 0) {
       const int sample = waiting[--count];
+      ++labelled;
       for (int axis = 0; axis < 3; ++axis)
         for (const int way : {-1, 1}) {
           const int place = along(sample, axis) + way;
@@ -46,6 +48,7 @@ void label(const float* values, BlockParts& block) {
         }
     }
     ++block.parts;
+    block.inside_samples.push_back(static_cast<uint16_t>(inside ? labelled : 0));
   }
 }
 
@@ -87,7 +90,10 @@ class Parts {
     for_each_contact(
         [&](size_t a, int sample_a, size_t b, int sample_b) { join_unless(node(a, sample_a), node(b, sample_b)); });
     for_each_brick([&](const std::array<int, 3>&, size_t brick) {
-      if (field_.brick(brick) < 0 || blocks_[static_cast<size_t>(field_.brick(brick))].parts == 1) return;
+      // One or two parts cannot both be other than `root` unless a neighbour brought them: look only where they are.
+      uint32_t others = 0;
+      for (uint32_t part = 0; part < part_nodes(brick); ++part) others += find(first_[brick] + part) != root;
+      if (others < 2) return;
       for (int axis = 0; axis < 3; ++axis)
         for (int sample = 0; sample < samples_per_brick; ++sample)
           if (along(sample, axis) + 1 < side)
@@ -101,6 +107,11 @@ class Parts {
   bool inside(size_t brick, int sample) const {
     const int32_t block = field_.brick(brick);
     return block >= 0 ? field_.block(block)[sample] < 0 : block == Field::all_inside;
+  }
+  uint32_t first_node(size_t brick) const { return first_[brick]; }
+  uint32_t part_nodes(size_t brick) const {
+    const int32_t block = field_.brick(brick);
+    return block >= 0 ? blocks_[static_cast<size_t>(block)].parts : 1U;
   }
   /// Samples inside, by root; 0 for parts of the outside.
   const std::vector<size_t>& inside_samples() const { return inside_samples_; }
@@ -143,8 +154,9 @@ class Parts {
         inside_samples_[find(first_[brick])] += Field::samples_per_brick;
         return;
       }
-      for (int sample = 0; sample < samples_per_brick; ++sample)
-        if (inside(brick, sample)) ++inside_samples_[find(node(brick, sample))];
+      const BlockParts& block = blocks_[static_cast<size_t>(field_.brick(brick))];
+      for (uint32_t part = 0; part < block.parts; ++part)
+        inside_samples_[find(first_[brick] + part)] += block.inside_samples[part];
     });
   }
 
@@ -174,6 +186,7 @@ SolidParts keep_largest_part(Field& field, const Work& work) {
   const uint32_t outside = parts.find(parts.node(0, 0));
   const auto bricks = field.bricks();
   const size_t count = static_cast<size_t>(bricks[0]) * static_cast<size_t>(bricks[1]) * static_cast<size_t>(bricks[2]);
+  std::vector<bool> part_inside;
   for (size_t brick = 0; brick < count; ++brick) {
     if (field.brick(brick) < 0) {
       const bool was_inside = field.brick(brick) == Field::all_inside;
@@ -182,10 +195,13 @@ SolidParts keep_largest_part(Field& field, const Work& work) {
       field.set_brick(brick, is_inside ? Field::all_inside : Field::all_outside);
       continue;
     }
+    const uint32_t first = parts.first_node(brick);
+    part_inside.resize(parts.part_nodes(brick));
+    for (uint32_t part = 0; part < part_inside.size(); ++part) part_inside[part] = parts.find(first + part) != outside;
     float* values = field.block(field.brick(brick));
     for (int sample = 0; sample < samples_per_brick; ++sample) {
       float& value = values[sample];
-      const bool is_inside = parts.find(parts.node(brick, sample)) != outside;
+      const bool is_inside = part_inside[parts.node(brick, sample) - first];
       if (is_inside && value >= 0) ++result.filled_samples;
       const float magnitude = std::max(std::abs(value), std::numeric_limits<float>::min());
       value = is_inside ? -magnitude : magnitude;

@@ -235,50 +235,74 @@ class Carving {
     });
   }
 
+  /// A brick's samples, an eighth at a time: many cameras settle an eighth at one look.
   void sample_brick(const Node& node, float* values) const {
-    std::array<float, Field::samples_per_brick> x, y, z;  // world
+    for (int part = 0; part < 8; ++part) {
+      const std::array<int, 3> first{(part & 1) * eighth, (part >> 1 & 1) * eighth, (part >> 2) * eighth};
+      const Samples part_values = sample_eighth(
+          node, {node.brick[0] * side + first[0], node.brick[1] * side + first[1], node.brick[2] * side + first[2]});
+      for (int k = 0; k < eighth; ++k)
+        for (int j = 0; j < eighth; ++j)
+          std::copy_n(part_values.begin() + (k * eighth + j) * eighth, eighth,
+                      values + ((first[2] + k) * side + first[1] + j) * side + first[0]);
+    }
+  }
+
+  static constexpr int eighth = side / 2;  // samples along the side of an eighth of a brick
+  using Samples = std::array<float, static_cast<size_t>(eighth) * eighth * eighth>;
+
+  Samples sample_eighth(const Node& node, const std::array<int, 3>& first) const {
+    Samples x, y, z;  // world
+    Samples values;
     const Grid& grid = field_.grid();
     size_t s = 0;
-    for (int k = 0; k < side; ++k)
-      for (int j = 0; j < side; ++j)
-        for (int i = 0; i < side; ++i, ++s) {
-          const Eigen::Vector3d p =
-              grid.point(node.brick[0] * side + i, node.brick[1] * side + j, node.brick[2] * side + k);
+    for (int k = 0; k < eighth; ++k)
+      for (int j = 0; j < eighth; ++j)
+        for (int i = 0; i < eighth; ++i, ++s) {
+          const Eigen::Vector3d p = grid.point(first[0] + i, first[1] + j, first[2] + k);
           x[s] = static_cast<float>(p.x());
           y[s] = static_cast<float>(p.y());
           z[s] = static_cast<float>(p.z());
           const double outside_box = ((p - box_.center()).cwiseAbs() - 0.5 * box_.sizes()).maxCoeff();
           values[s] = std::clamp(static_cast<float>(outside_box), -cut_off_m_, cut_off_m_);
         }
+    const double half_m = 0.5 * (eighth - 1) * grid.voxel_m;
+    const Eigen::Vector3d center = grid.point(first[0], first[1], first[2]) + Eigen::Vector3d::Constant(half_m);
     const bool count_views = node.sure_views < min_views_;
-    // For every sample how far inside the image of each camera it is, metres.
-    std::vector<std::array<float, Field::samples_per_brick>> within(count_views ? node.open.size() : 0);
-    for (size_t n = 0; n < node.open.size(); ++n)
-      carve(*views_[node.open[n]], x, y, z, values, count_views ? within[n].data() : nullptr);
-    if (!count_views) return;
+    std::vector<Samples> within;  // for every open camera, how far inside its image the samples are, metres
+    for (const uint32_t v : node.open) {
+      const Verdict verdict = judge(*views_[v], center, half_m * std::sqrt(3.0));
+      if (verdict.seen && verdict.least_m > static_cast<double>(cut_off_m_)) {
+        values.fill(cut_off_m_);
+        return values;
+      }
+      const bool says_nothing = verdict.hidden || verdict.most_m < -static_cast<double>(cut_off_m_);
+      if (says_nothing && !count_views) continue;
+      carve(*views_[v], x, y, z, values, count_views ? &within.emplace_back() : nullptr);
+    }
+    if (!count_views) return values;
     const auto rank = static_cast<size_t>(min_views_ - node.sure_views - 1);
-    std::vector<float> ranked(node.open.size());
-    for (s = 0; s < Field::samples_per_brick; ++s) {
+    std::vector<float> ranked(within.size());
+    for (s = 0; s < values.size(); ++s) {
       for (size_t n = 0; n < ranked.size(); ++n) ranked[n] = within[n][s];
       std::nth_element(ranked.begin(), ranked.begin() + static_cast<std::ptrdiff_t>(rank), ranked.end(),
                        std::greater<>());
       values[s] = std::clamp(-ranked[rank], values[s], cut_off_m_);
     }
+    return values;
   }
 
-  using Coordinates = std::array<float, Field::samples_per_brick>;
-
-  void carve(const View& view, const Coordinates& x, const Coordinates& y, const Coordinates& z, float* values,
-             float* within_m) const {
-    Coordinates u, v, depth;  // pixels, pixels, metres
+  void carve(const View& view, const Samples& x, const Samples& y, const Samples& z, Samples& values,
+             Samples* within_m) const {
+    Samples u, v, depth;  // pixels, pixels, metres
     project(view, x, y, z, u, v, depth);
     const float right = static_cast<float>(view.camera->intrinsics.width) - 0.5F;
     const float bottom = static_cast<float>(view.camera->intrinsics.height) - 0.5F;
     const auto per_focal = static_cast<float>(1 / view.focal_px);
-    for (size_t s = 0; s < Field::samples_per_brick; ++s) {
+    for (size_t s = 0; s < values.size(); ++s) {
       const float pixel_m = depth[s] * per_focal;
       const float within_px = std::min(std::min(u[s] + 0.5F, right - u[s]), std::min(v[s] + 0.5F, bottom - v[s]));
-      if (within_m != nullptr) within_m[s] = within_px * pixel_m;
+      if (within_m != nullptr) (*within_m)[s] = within_px * pixel_m;
       if (!(within_px >= 0) || values[s] >= cut_off_m_) continue;
       const float distance_m = view.outline.at(u[s], v[s]) * pixel_m;
       values[s] = std::clamp(distance_m, values[s], cut_off_m_);
@@ -286,8 +310,8 @@ class Carving {
   }
 
   /// As project_camera_point, in single precision and for many points; what is not imaged lands far outside.
-  static void project(const View& view, const Coordinates& x, const Coordinates& y, const Coordinates& z,
-                      Coordinates& u, Coordinates& v, Coordinates& depth) {
+  static void project(const View& view, const Samples& x, const Samples& y, const Samples& z, Samples& u, Samples& v,
+                      Samples& depth) {
     const Intrinsics& k = view.camera->intrinsics;
     const Eigen::Matrix3f& r = view.rotation;
     const Eigen::Vector3f& t = view.translation;
@@ -299,7 +323,7 @@ class Carving {
     const auto radius2 = static_cast<float>(view.image_radius2);
     constexpr auto near = static_cast<float>(nearest_m);
     constexpr float nowhere = -1e6F;
-    for (size_t s = 0; s < Field::samples_per_brick; ++s) {
+    for (size_t s = 0; s < x.size(); ++s) {
       const float camera_z = r(2, 0) * x[s] + r(2, 1) * y[s] + r(2, 2) * z[s] + t[2];
       const float d = camera_z > near ? camera_z : near;
       const float a = (r(0, 0) * x[s] + r(0, 1) * y[s] + r(0, 2) * z[s] + t[0]) / d;
