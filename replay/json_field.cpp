@@ -68,6 +68,8 @@ std::string quoted(const Json& json) {
   return text;
 }
 
+bool is_control(unsigned char c) { return c < 0x20 || c == 0x7f; }
+
 std::string decimal(double number) { return Json(number).dump(); }
 
 }  // namespace
@@ -180,11 +182,19 @@ bool JsonField::boolean() const {
 std::string JsonField::text(size_t longest) const {
   if (json_->is_string()) {
     const auto& text = json_->get_ref<const std::string&>();
-    const bool printable =
-        std::none_of(text.begin(), text.end(), [](unsigned char c) { return c < 0x20 || c == 0x7f; });
-    if (printable && text.size() <= longest) return text;
+    if (text.size() <= longest && std::none_of(text.begin(), text.end(), is_control)) return text;
   }
   refuse_value("a string of at most " + std::to_string(longest) + " bytes without control characters");
+  return {};
+}
+
+std::string JsonField::free_text(size_t longest) const {
+  if (json_->is_string() && json_->get_ref<const std::string&>().size() <= longest) {
+    auto text = json_->get<std::string>();
+    std::replace_if(text.begin(), text.end(), is_control, ' ');
+    return text;
+  }
+  refuse_value("a string of at most " + std::to_string(longest) + " bytes");
   return {};
 }
 

@@ -64,6 +64,8 @@ class JsonField {
   bool boolean() const;
   /// Without control characters, at most `longest` bytes.
   std::string text(size_t longest) const;
+  /// What people wrote, at most `longest` bytes; control characters become spaces.
+  std::string free_text(size_t longest) const;
   /// is_safe_id
   std::string id() const;
   /// is_safe_relative_path

@@ -25,14 +25,12 @@ constexpr int format_version = 1;
 constexpr size_t most_cameras = 256;
 constexpr size_t most_shots = 1000;
 constexpr size_t most_frames = 100000;  // of one shot
-constexpr int highest_index = 99999;
 constexpr int longest_side_px = 32768;
 constexpr double farthest_m = 1000;
 constexpr double longest_volume_side_m = 10;
 constexpr double largest_focal_px = 1e7;
 constexpr double largest_distortion = 1e4;
 constexpr Timestamp latest_ns = 4'000'000'000'000'000'000;  // differences of two stay inside 64 bits
-constexpr size_t longest_text = 1000;
 
 void expect_format(const JsonField& root, const std::string& format) {
   const JsonField field = root.member("format");
@@ -223,31 +221,13 @@ Shot read_shot(const JsonField& field, ShotRole role, const RigFile& rig) {
   return shot;
 }
 
-/// "2026-11-22T10:15:00Z", also with fractions of a second or a zone as +01:00.
-bool is_date_and_time(const std::string& text) {
-  const std::string form = "dddd-dd-ddTdd:dd:dd";
-  const auto is_digit = [](char c) { return c >= '0' && c <= '9'; };
-  const auto matches = [&](size_t at, const std::string& part) {
-    if (text.size() < at + part.size()) return false;
-    for (size_t i = 0; i < part.size(); ++i)
-      if (part[i] == 'd' ? !is_digit(text[at + i]) : text[at + i] != part[i]) return false;
-    return true;
-  };
-  if (!matches(0, form)) return false;
-  size_t at = form.size();
-  if (matches(at, ".d"))
-    for (++at; at < text.size() && is_digit(text[at]);) ++at;
-  if (text.substr(at) == "Z") return true;
-  return text.size() == at + 6 && (matches(at, "+dd:dd") || matches(at, "-dd:dd"));
-}
-
 void read_header(const JsonField& root, Recording& recording) {
   recording.id = root.member("id").id();
   const JsonField created = root.member("created");
   recording.created = created.text(longest_text);
   if (root.ok() && !is_date_and_time(recording.created))
     created.refuse_value("a date and time such as \"2026-11-22T10:15:00Z\"");
-  if (const auto label = root.find("label")) recording.label = label->text(longest_text);
+  if (const auto label = root.find("label")) recording.label = label->free_text(longest_text);
   if (const auto face = root.find("face")) recording.face = face->text(longest_text);
 }
 
@@ -268,6 +248,23 @@ std::vector<Shot> read_shots(const JsonField& shots, const RigFile& rig) {
 }
 
 }  // namespace
+
+bool is_date_and_time(const std::string& text) {
+  const std::string form = "dddd-dd-ddTdd:dd:dd";
+  const auto is_digit = [](char c) { return c >= '0' && c <= '9'; };
+  const auto matches = [&](size_t at, const std::string& part) {
+    if (text.size() < at + part.size()) return false;
+    for (size_t i = 0; i < part.size(); ++i)
+      if (part[i] == 'd' ? !is_digit(text[at + i]) : text[at + i] != part[i]) return false;
+    return true;
+  };
+  if (!matches(0, form)) return false;
+  size_t at = form.size();
+  if (matches(at, ".d"))
+    for (++at; at < text.size() && is_digit(text[at]);) ++at;
+  if (text.substr(at) == "Z") return true;
+  return text.size() == at + 6 && (matches(at, "+dd:dd") || matches(at, "-dd:dd"));
+}
 
 const Shot* Recording::find(ShotRole role) const {
   const auto found = std::find_if(shots.begin(), shots.end(), [&](const Shot& shot) { return shot.role == role; });

@@ -13,6 +13,14 @@
 
 namespace booth {
 
+/// Bytes of a label and other free text.
+constexpr size_t longest_text = 1000;
+/// Of a frame in a sequence that does not say how long it is.
+constexpr int highest_index = 99999;
+
+/// "2026-11-22T10:15:00Z", also with fractions of a second or a zone as +01:00.
+bool is_date_and_time(const std::string& text);
+
 /// Where one file of a recording is, with every symbolic link followed. Messages begin with the file as the
 /// recording names it. @error not_found; @error invalid_file  it leads out of the folder; @error io
 Result<std::filesystem::path> resolve_recording_file(const std::filesystem::path& folder, const std::string& file);

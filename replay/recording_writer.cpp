@@ -52,6 +52,11 @@ Result<void> take_over(const Recording& from, const std::string& source, Durable
   return folder.write(target, *bytes);
 }
 
+int last_index(const ShotHeader& shot) {
+  if (shot.role == ShotRole::body) return 0;
+  return shot.pattern ? pattern_count(*shot.pattern) - 1 : highest_index;
+}
+
 std::string name_of(const std::string& shot, const std::string& camera, int index) {
   return "frame " + std::to_string(index) + " of " + camera + " in shot " + shot;
 }
@@ -74,7 +79,7 @@ struct RecordingWriter::Content {
     const auto found =
         std::find_if(shots.begin(), shots.end(), [&](const OpenShot& s) { return s.header.name == shot; });
     if (found == shots.end()) return invalid("shot " + shot + " was not begun");
-    if (index < 0 || (index > 0 && found->header.role == ShotRole::body))
+    if (index < 0 || index > last_index(found->header))
       return invalid(name_of(shot, camera, index) + ": the index is out of range");
     if (!found->taken.emplace(camera, index).second) return invalid(name_of(shot, camera, index) + " came twice");
     return found->header;
@@ -99,6 +104,9 @@ RecordingWriter::~RecordingWriter() = default;
 Result<std::unique_ptr<RecordingWriter>> RecordingWriter::begin(const fs::path& parent, const RecordingHeader& header,
                                                                 const Rig& rig, const SpoolOptions& options) {
   if (const auto checked = check(rig); !checked) return invalid("the rig cannot be stored: " + checked.error().message);
+  if (!is_date_and_time(header.created)) return invalid("\"" + header.created + "\" is not a date and time");
+  if (header.label.size() > longest_text) return invalid("the label is longer than " + std::to_string(longest_text));
+  if (!header.face.empty() && !is_safe_id(header.face)) return invalid("\"" + header.face + "\" is no face mode");
   auto folder = DurableFolder::begin(parent, header.id);
   if (!folder) return folder.error();
   if (const auto written = folder->write("rig.json", write_rig_json(rig)); !written) return written.error();
@@ -185,6 +193,8 @@ Result<void> RecordingWriter::commit() {
   }
   if (const auto written = content_->folder.write("recording.json", write_recording_json(recording)); !written)
     return written;
+  const auto readable = read_recording(content_->folder.path());
+  if (!readable) return Error{ErrorCode::internal, "the recording cannot be read again: " + readable.error().message};
   return content_->folder.commit();
 }
 

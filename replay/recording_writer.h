@@ -26,10 +26,10 @@ struct SpoolOptions {
 
 /// What recording.json says about the capture as a whole.
 struct RecordingHeader {
-  std::string id;       ///< is_safe_id; also the folder's name
-  std::string created;  ///< ISO 8601, UTC
-  std::string label;    ///< may be empty
-  std::string face;     ///< how the capture asks for the face ("auto", …); may be empty
+  std::string id = {};       ///< is_safe_id; also the folder's name
+  std::string created = {};  ///< ISO 8601, UTC: "2026-11-22T10:15:00Z"
+  std::string label = {};    ///< at most 1000 bytes; may be empty
+  std::string face = {};     ///< how the capture asks for the face ("auto", …); may be empty
 };
 
 /// What recording.json says about a shot, its frames aside.
@@ -48,7 +48,7 @@ struct ShotHeader {
 class RecordingWriter {
  public:
   /// @param rig  check(rig) holds
-  /// @error invalid_argument  an unsafe id or an invalid rig; @error disk_full, io
+  /// @error invalid_argument  a header that is not as RecordingHeader says, or an invalid rig; @error disk_full, io
   static Result<std::unique_ptr<RecordingWriter>> begin(const std::filesystem::path& parent,
                                                         const RecordingHeader& header, const Rig& rig,
                                                         const SpoolOptions& options = {});
