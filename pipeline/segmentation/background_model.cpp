@@ -61,20 +61,22 @@ constexpr int drift_bins = 400;
 constexpr float expected_drift = 0.15F;
 /// How far a background cell's difference may lie from the common drift: slow variation over the image, darker or
 /// lighter by shadow and bounced light, and in chromaticity.
-constexpr float drift_slack = 0.08F;
+constexpr std::array<float, 3> drift_slack{0.08F, 0.08F, 0.06F};  // one refinement after the other
 constexpr float drift_chroma_slack = 0.025F;
 /// Cells along the edge of a block that gets one estimate of the drift.
 constexpr int drift_block = 16;
 /// Over how many blocks the drift is smoothed: shadows are to stay visible as such.
 constexpr float drift_smoothing_blocks = 4.0F;
+/// What a cell that disagrees weighs beside one that agrees.
+constexpr float drift_inertia = 0.01F;
 
-/// The most common difference, sought in a histogram and refined by the mean around it.
-float common_difference(const std::vector<float>& difference) {
+/// The most common value, sought in a histogram and refined by the mean around it.
+float most_common(const std::vector<float>& values) {
   std::array<float, drift_bins> histogram{};
   constexpr float bin = 2 * drift_range / drift_bins;
-  for (const float d : difference) {
-    const int i = static_cast<int>((d + drift_range) / bin);
-    if (d > -drift_range && i < drift_bins) histogram[i] += 1;
+  for (const float v : values) {
+    const int i = static_cast<int>((v + drift_range) / bin);
+    if (v > -drift_range && i < drift_bins) histogram[i] += 1;
   }
   int best = drift_bins / 2;
   float best_count = 0;
@@ -91,56 +93,42 @@ float common_difference(const std::vector<float>& difference) {
   const float mode = (static_cast<float>(best) + 0.5F) * bin - drift_range;
   double sum = 0;
   size_t count = 0;
-  for (const float d : difference) {
-    if (std::abs(d - mode) > 3 * bin) continue;
-    sum += d;
+  for (const float v : values) {
+    if (std::abs(v - mode) > 3 * bin) continue;
+    sum += v;
     ++count;
   }
   return count > 0 ? static_cast<float>(sum / static_cast<double>(count)) : 0;
 }
 
-bool agrees_with(const CellPlanes& difference, const std::array<float, 3>& drift, size_t cell) {
-  float deviation[3];
+/// The drift that most of the image shares. Brightness may vary over the image and then peaks where it likes, so that
+/// the channels need not peak in the same place; white balance hardly varies and is sought in their differences.
+std::array<float, 3> common_drift(const CellPlanes& difference) {
+  const std::vector<float>& red = difference.values[0];
+  if (difference.channels == 1) return {most_common(red), 0, 0};
+  const std::vector<float>& green = difference.values[1];
+  const std::vector<float>& blue = difference.values[2];
+  std::vector<float> mixed(red.size());
+  for (size_t i = 0; i < mixed.size(); ++i) mixed[i] = (red[i] + green[i] + blue[i]) / 3;
+  const float lightness = most_common(mixed);
+  for (size_t i = 0; i < mixed.size(); ++i) mixed[i] = red[i] - green[i];
+  const float red_green = most_common(mixed);
+  for (size_t i = 0; i < mixed.size(); ++i) mixed[i] = blue[i] - green[i];
+  const float blue_green = most_common(mixed);
+  const float of_green = lightness - (red_green + blue_green) / 3;
+  return {of_green + red_green, of_green, of_green + blue_green};
+}
+
+/// Whether a cell's difference can be the drift expected there, give or take the slack.
+bool agrees_with(const CellPlanes& difference, const CellPlanes& drift, size_t cell, float slack) {
+  std::array<float, 3> deviation{};
   for (int c = 0; c < difference.channels; ++c) {
-    deviation[c] = difference.values[c][cell] - drift[c];
-    if (std::abs(deviation[c]) > drift_slack) return false;
+    deviation[c] = difference.values[c][cell] - drift.values[c][cell];
+    if (std::abs(deviation[c]) > slack) return false;
   }
   if (difference.channels == 1) return true;
   return std::abs(deviation[0] - deviation[1]) < drift_chroma_slack &&
          std::abs(deviation[2] - deviation[1]) < drift_chroma_slack;
-}
-
-/// Per block the mean deviation from the common drift of the cells that agree with it, smoothed over the image.
-/// Where few agree, the neighbourhood's drift carries over.
-CellPlanes slow_drift(const CellPlanes& difference, const std::array<float, 3>& common, const CellGrid& grid,
-                      int* blocks_x, int* blocks_y, double* support) {
-  const int nx = (grid.width + drift_block - 1) / drift_block;
-  const int ny = (grid.height + drift_block - 1) / drift_block;
-  CellPlanes sums = make_planes(difference.channels, static_cast<size_t>(nx) * static_cast<size_t>(ny));
-  std::vector<float> weight(sums.values[0].size(), 0);
-  size_t agreeing = 0;
-  for (int y = 0; y < grid.height; ++y) {
-    for (int x = 0; x < grid.width; ++x) {
-      const size_t cell = grid.index(x, y);
-      if (!agrees_with(difference, common, cell)) continue;
-      const size_t block =
-          static_cast<size_t>(y / drift_block) * static_cast<size_t>(nx) + static_cast<size_t>(x / drift_block);
-      for (int c = 0; c < difference.channels; ++c) sums.values[c][block] += difference.values[c][cell] - common[c];
-      weight[block] += 1;
-      ++agreeing;
-    }
-  }
-  *support = static_cast<double>(agreeing) / static_cast<double>(grid.count());
-  gaussian_blur(weight, nx, ny, drift_smoothing_blocks);
-  // A trace of the common drift keeps the quotient defined where no block of the neighbourhood agrees.
-  const float trace = 0.01F * drift_block * drift_block;
-  for (int c = 0; c < difference.channels; ++c) {
-    gaussian_blur(sums.values[c], nx, ny, drift_smoothing_blocks);
-    for (size_t i = 0; i < weight.size(); ++i) sums.values[c][i] = common[c] + sums.values[c][i] / (weight[i] + trace);
-  }
-  *blocks_x = nx;
-  *blocks_y = ny;
-  return sums;
 }
 
 /// Block values at every cell, linear between the blocks' centres.
@@ -168,6 +156,39 @@ void expand_blocks(const std::vector<float>& blocks, int nx, int ny, const CellG
       out[grid.index(x, y)] = left + fx * (right - left);
     }
   }
+}
+
+/// Replaces a drift by the mean difference, block by block and smoothed over the image, of the cells that agree with
+/// it. Where few agree, the neighbourhood's drift carries over.
+/// @return share of the cells that agreed
+double refine_drift(const CellPlanes& difference, const CellGrid& grid, float slack, CellPlanes& drift) {
+  const int nx = (grid.width + drift_block - 1) / drift_block;
+  const int ny = (grid.height + drift_block - 1) / drift_block;
+  const size_t blocks = static_cast<size_t>(nx) * static_cast<size_t>(ny);
+  CellPlanes sums = make_planes(difference.channels, blocks);
+  std::vector<float> weight(blocks, 0);
+  size_t agreeing = 0;
+  for (int y = 0; y < grid.height; ++y) {
+    for (int x = 0; x < grid.width; ++x) {
+      const size_t cell = grid.index(x, y);
+      const size_t block =
+          static_cast<size_t>(y / drift_block) * static_cast<size_t>(nx) + static_cast<size_t>(x / drift_block);
+      const bool agrees = agrees_with(difference, drift, cell, slack);
+      // A trace of the drift found before keeps the quotient defined where no block of the neighbourhood agrees.
+      const float share = agrees ? 1.0F : drift_inertia;
+      const CellPlanes& source = agrees ? difference : drift;
+      for (int c = 0; c < difference.channels; ++c) sums.values[c][block] += share * source.values[c][cell];
+      weight[block] += share;
+      agreeing += agrees;
+    }
+  }
+  gaussian_blur(weight, nx, ny, drift_smoothing_blocks);
+  for (int c = 0; c < difference.channels; ++c) {
+    gaussian_blur(sums.values[c], nx, ny, drift_smoothing_blocks);
+    for (size_t i = 0; i < blocks; ++i) sums.values[c][i] /= weight[i];
+    expand_blocks(sums.values[c], nx, ny, grid, drift.values[c]);
+  }
+  return static_cast<double>(agreeing) / static_cast<double>(grid.count());
 }
 
 // ---- noise ----------------------------------------------------------------------------------------------------
@@ -330,22 +351,22 @@ Residual compare(const BackgroundModel& background, const CellFrame& body) {
   residual.body = body.lightness;
   residual.difference = make_planes(channels, grid.count());
   residual.variance = make_planes(channels, grid.count());
-  residual.drift.channels = channels;
   for (int c = 0; c < channels; ++c) {
     const std::vector<float>& empty = background.lightness.values[c];
     const std::vector<float>& seen = body.lightness.values[c];
     std::vector<float>& difference = residual.difference.values[c];
     for (size_t i = 0; i < difference.size(); ++i) difference[i] = seen[i] - empty[i];
-    residual.mean_drift[c] = common_difference(difference);
   }
-  int blocks_x = 0, blocks_y = 0;
-  const CellPlanes blocks =
-      slow_drift(residual.difference, residual.mean_drift, grid, &blocks_x, &blocks_y, &residual.drift_support);
+  residual.mean_drift = common_drift(residual.difference);
+  residual.drift = make_planes(channels, grid.count());
+  for (int c = 0; c < channels; ++c)
+    std::fill_n(residual.drift.values[c].begin(), grid.count(), residual.mean_drift[c]);
+  for (const float slack : drift_slack) {
+    residual.drift_support = refine_drift(residual.difference, grid, slack, residual.drift);
+  }
   for (int c = 0; c < channels; ++c) {
     std::vector<float>& difference = residual.difference.values[c];
-    std::vector<float>& drift = residual.drift.values[c];
-    expand_blocks(blocks.values[c], blocks_x, blocks_y, grid, drift);
-    for (size_t i = 0; i < difference.size(); ++i) difference[i] -= drift[i];
+    for (size_t i = 0; i < difference.size(); ++i) difference[i] -= residual.drift.values[c][i];
 
     const std::vector<float>& level = background.level.values[c];
     const auto curve = noise_curve(difference, level, grid);

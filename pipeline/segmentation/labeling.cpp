@@ -21,7 +21,12 @@ constexpr float largest_evidence = 12;
 constexpr float clear_subject = 3;
 /// What a cell says that is darker than the background by what a soft shadow could take: next to nothing. Its
 /// boundary decides: shadows fade in, things have edges.
-constexpr float shadow_evidence = -0.05F;
+constexpr float shadow_evidence = 0.05F;
+/// Evidence within ± this leaves a cell's patch to be judged by its rim, which then says so much per cell. A rim's
+/// boundary is an edge when it costs less than this share of one in flat colour.
+constexpr float doubtful_evidence = 2;
+constexpr float patch_evidence = 1;
+constexpr float no_edge = 0.6F;
 /// Bounced light tints the background by this much (lightness differences between channels), shadows by more.
 constexpr float tint = 0.02F;
 constexpr float tint_in_shadow = 0.08F;
@@ -168,6 +173,46 @@ class BoundaryCost {
   const Residual& residual_;
   float smoothness_;
 };
+
+/// Settles, patch by patch, what could be a shadow as well as clothes in the background's hue. Patches are bounded by
+/// edges; a shadow's rim towards clear background fades, that of a thing does not. A patch without such a rim lies
+/// inside the subject.
+void judge_patches(const CellGrid& grid, const Residual& residual, std::vector<float>& evidence) {
+  const BoundaryCost cost(residual, 1);
+  const auto is_edge = [&](size_t a, size_t b) {
+    return cost(a, b, false) < static_cast<int32_t>(no_edge * capacity_scale);
+  };
+  std::vector<float> verdict(grid.count(), 0);
+  CellMask visited(evidence.size(), 0);
+  std::vector<size_t> members;
+  for (size_t seed = 0; seed < grid.count(); ++seed) {
+    if (visited[seed] != 0 || std::abs(evidence[seed]) > doubtful_evidence) continue;
+    visited[seed] = 1;
+    members.assign(1, seed);
+    size_t rim = 0, sharp = 0;
+    for (size_t n = 0; n < members.size(); ++n) {
+      const size_t cell = members[n];
+      const int x = static_cast<int>(cell % static_cast<size_t>(grid.width));
+      const int y = static_cast<int>(cell / static_cast<size_t>(grid.width));
+      for (const int k : {1, 3, 4, 6}) {
+        const int nx = x + neighbor_steps[k][0];
+        const int ny = y + neighbor_steps[k][1];
+        if (!grid.contains(nx, ny)) continue;
+        const size_t other = grid.index(nx, ny);
+        if (evidence[other] < -doubtful_evidence) {
+          ++rim;
+          sharp += is_edge(cell, other);
+        } else if (visited[other] == 0 && evidence[other] <= doubtful_evidence && !is_edge(cell, other)) {
+          visited[other] = 1;
+          members.push_back(other);
+        }
+      }
+    }
+    const double sharp_share = rim > 0 ? static_cast<double>(sharp) / static_cast<double>(rim) : 1;
+    for (const size_t cell : members) verdict[cell] = static_cast<float>(2 * sharp_share - 1) * patch_evidence;
+  }
+  for (size_t i = 0; i < evidence.size(); ++i) evidence[i] += verdict[i];
+}
 
 /// Cells whose neighbourhood agrees so clearly that no boundary can run there; the others are the graph's nodes.
 enum class Certainty : uint8_t { open, subject, background };
@@ -321,6 +366,8 @@ Labeling label_cells(const CellGrid& grid, const Residual& residual, const Label
     const float texture = roughness_evidence * std::max(0.0F, rough[i] - noisy_roughness);
     evidence[i] = std::min(evidence[i] + std::min(texture, largest_roughness_evidence), largest_evidence);
   }
+
+  judge_patches(grid, residual, evidence);
 
   Labeling labeling;
   labeling.subject = cut(evidence, residual, grid, options.smoothness);
