@@ -135,6 +135,7 @@ std::string one_line(std::string text) {
 std::string quoted(const toml::node& node) {
   if (node.is_table()) return "a table";
   if (node.is_array()) return "an array";
+  if (const auto* text = node.as_string()) return "\"" + one_line(text->get()) + "\"";
   std::ostringstream text;
   node.visit([&](const auto& value) { text << value; });
   return one_line(text.str());
@@ -242,7 +243,8 @@ class Reader {
     if (node == nullptr) return;
     const auto number = node->value_exact<int64_t>();
     if (!number || *number < lowest || *number > highest)
-      return refuse(key, *node, range(std::to_string(lowest), std::to_string(highest)));
+      return refuse(key, *node,
+                    (number ? "" : "a whole number, ") + range(std::to_string(lowest), std::to_string(highest)));
     value = static_cast<Integer>(*number);
   }
 

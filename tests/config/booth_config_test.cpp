@@ -1,0 +1,245 @@
+#include "config/booth_config.h"
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <fstream>
+#include <random>
+#include <regex>
+#include <sstream>
+
+#include "replay/durable_folder.h"
+#include "tests/replay/scratch_folder.h"
+
+namespace booth {
+namespace {
+
+namespace fs = std::filesystem;
+using testing::AllOf;
+using testing::ElementsAre;
+using testing::HasSubstr;
+using testing::IsEmpty;
+using testing::Not;
+
+const fs::path default_file = BOOTH_SOURCE_DIR "/config/boothd.toml";
+
+std::vector<std::string> faults_of(std::string_view toml) {
+  std::vector<std::string> faults;
+  for (const ConfigFault& fault : parse_config(toml, "/etc/booth").faults) faults.push_back(fault.to_string());
+  return faults;
+}
+
+std::string text_of(const fs::path& file) {
+  const auto bytes = read_file(file, 1 << 20);
+  return bytes ? std::string(bytes->begin(), bytes->end()) : std::string();
+}
+
+/// The file with its examples, which are comments that begin without a space, switched on.
+std::string with_examples(const std::string& text) {
+  return std::regex_replace(text, std::regex("(^|\n)#(?=[a-z\\[])"), "$1");
+}
+
+/// "section.key" of every line that sets one.
+std::vector<std::string> keys_of(const std::string& text) {
+  std::vector<std::string> keys;
+  std::string section;
+  std::istringstream lines(text);
+  for (std::string line; std::getline(lines, line);) {
+    std::smatch match;
+    if (std::regex_search(line, match, std::regex(R"(^\[\[([a-z_.]+)\]\])")))
+      section = match[1].str() + "[]";
+    else if (std::regex_search(line, match, std::regex(R"(^\[([a-z_.]+)\])")))
+      section = match[1].str();
+    else if (std::regex_search(line, match, std::regex(R"(^([a-z_]+) = )")))
+      keys.push_back(section + "." + match[1].str());
+  }
+  return keys;
+}
+
+TEST(DefaultFile, HoldsEveryKeyAndNoOther) { EXPECT_EQ(keys_of(with_examples(text_of(default_file))), config_keys()); }
+
+TEST(DefaultFile, SaysWhatIsCompiledIn) {
+  const auto config = load_config(default_file);
+  ASSERT_TRUE(config) << config.error().message;
+  EXPECT_EQ(write_config(*config), write_config(BoothConfig{}));
+}
+
+TEST(DefaultFile, ItsExampleIsValidAndShowsTheDefaults) {
+  const ConfigReading reading = parse_config(with_examples(text_of(default_file)), "/");
+  ASSERT_THAT(reading.faults, IsEmpty());
+  ASSERT_EQ(reading.config.replay.faults.size(), 1U);
+  const ReplayFault& example = reading.config.replay.faults[0];
+  const ReplayFault plain;
+  EXPECT_EQ(example.kind, plain.kind);
+  EXPECT_EQ(example.camera, plain.camera);
+  EXPECT_EQ(example.role, plain.role);
+  EXPECT_EQ(example.delay_ms, plain.delay_ms);
+}
+
+TEST(ParseConfig, NothingIsTheDefault) {
+  const ConfigReading reading = parse_config("", "/etc/booth");
+  EXPECT_THAT(reading.faults, IsEmpty());
+  EXPECT_EQ(write_config(reading.config), write_config(BoothConfig{}));
+}
+
+TEST(ParseConfig, TakesWhatIsSet) {
+  const ConfigReading reading = parse_config(R"(
+      [booth]
+      name = "Stand 7 „Süd“"
+      state_directory = "state"
+      [api]
+      control = "ipc:///tmp/c"
+      [capture]
+      frame_timeout_ms = 1500
+      image_format = "jpeg"
+      keep_encoded = false
+      [jobs]
+      workers = 3
+      [log]
+      level = "debug"
+      [replay]
+      recording = "../demo/man"
+      pace = "fast"
+      cache_mib = 0
+      [[replay.faults]]
+      kind = "late"
+      camera = "body-03"
+      delay_ms = 250
+      [[replay.faults]]
+      kind = "lost"
+      role = "gray_code"
+      index = 4
+      capture = 2
+      [reconstruct]
+      face = "none"
+      triangles = 5000
+      voxel_mm = 8
+      )",
+                                             "/etc/booth");
+  for (const ConfigFault& fault : reading.faults) ADD_FAILURE() << fault.to_string();
+  const BoothConfig& config = reading.config;
+  EXPECT_EQ(config.booth.name, "Stand 7 „Süd“");
+  EXPECT_EQ(config.booth.avatars(), "/etc/booth/state/avatars");
+  EXPECT_EQ(config.api.control, "ipc:///tmp/c");
+  EXPECT_EQ(config.api.events, ApiConfig{}.events);
+  EXPECT_EQ(config.capture.frame_timeout_ms, 1500);
+  EXPECT_EQ(config.capture.images.format, SpoolOptions::Format::jpeg);
+  EXPECT_FALSE(config.capture.images.keep_encoded);
+  EXPECT_EQ(config.jobs.workers, 3);
+  EXPECT_EQ(config.log.level, LogLevel::debug);
+  EXPECT_EQ(config.replay.recording, "/etc/demo/man");
+  EXPECT_EQ(config.replay.pace, ReplayOptions::Pace::fast);
+  EXPECT_EQ(config.replay.cache_mib, 0U);
+  ASSERT_EQ(config.replay.faults.size(), 2U);
+  EXPECT_EQ(config.replay.faults[0].kind, ReplayFault::Kind::late);
+  EXPECT_EQ(config.replay.faults[0].camera, "body-03");
+  EXPECT_EQ(config.replay.faults[0].delay_ms, 250);
+  EXPECT_EQ(config.replay.faults[0].role, std::nullopt);
+  EXPECT_EQ(config.replay.faults[1].role, ShotRole::gray_code);
+  EXPECT_EQ(config.replay.faults[1].index, 4);
+  EXPECT_EQ(config.replay.faults[1].capture, 2);
+  EXPECT_EQ(config.reconstruct.face, FaceMode::none);
+  EXPECT_EQ(config.reconstruct.decimation.triangles, 5000U);
+  EXPECT_DOUBLE_EQ(config.reconstruct.hull.voxel_m, 0.008);
+
+  const ConfigReading again = parse_config(write_config(config), "/elsewhere");
+  EXPECT_THAT(again.faults, IsEmpty());
+  EXPECT_EQ(write_config(again.config), write_config(config));
+}
+
+TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
+  EXPECT_THAT(
+      faults_of(R"(
+      colour = "red"
+      log = 3
+      [booth]
+      name = ""
+      [capture]
+      frame_timeout_ms = 0
+      min_cameras = "many"
+      image_format = "tiff"
+      jpeg_qualty = 90
+      keep_encoded = 1
+      [disk]
+      limit_mib = -5
+      [jobs]
+      workers = 2.5
+      [drivers]
+      camera = "webcam"
+      [replay]
+      recording = 7
+      faults = [{kind = "late"}, 3, {kind = "slow", index = -1, when = "now"}]
+      [reconstruct]
+      voxel_mm = nan
+      triangles = 9999999999999
+      )"),
+      testing::UnorderedElementsAre(
+          "colour: \"red\", expected one of the keys booth, api, capture, disk, jobs, log, drivers, replay, "
+          "reconstruct",
+          "log: 3, expected a table: [log]", "booth.name: \"\", expected a text of 1 … 64 bytes on one line",
+          "capture.frame_timeout_ms: 0, expected 50 … 60000",
+          "capture.min_cameras: \"many\", expected a whole number, 1 … 256",
+          "capture.image_format: \"tiff\", expected one of \"png\", \"jpeg\"",
+          "capture.jpeg_qualty: 90, expected one of the keys frame_timeout_ms, min_cameras, background_frames, "
+          "image_format, png_level, jpeg_quality, keep_encoded",
+          "capture.keep_encoded: 1, expected true or false", "disk.limit_mib: -5, expected 0 … 100000000",
+          "jobs.workers: 2.5, expected a whole number, 1 … 64", "drivers.camera: \"webcam\", expected \"replay\"",
+          "replay.recording: 7, expected a path", "replay.faults[1]: 3, expected a table",
+          "replay.faults[2].kind: \"slow\", expected one of \"missing\", \"late\", \"corrupt\", \"lost\"",
+          "replay.faults[2].index: -1, expected 0 … 1000000",
+          "replay.faults[2].when: \"now\", expected one of the keys kind, camera, role, index, capture, delay_ms",
+          "reconstruct.voxel_mm: nan, expected 1 … 50",
+          "reconstruct.triangles: 9999999999999, expected 500 … 1000000"));
+}
+
+TEST(ParseConfig, EndpointsAreLocalAndDifferent) {
+  EXPECT_THAT(faults_of("[api]\ncontrol = \"tcp://0.0.0.0:5555\""),
+              ElementsAre(AllOf(HasSubstr("api.control"), HasSubstr("tcp://0.0.0.0:5555"), HasSubstr("encryption"))));
+  for (const char* bad : {"", "ipc://", "ipc://relative", "udp://x", "/run/booth/control"})
+    EXPECT_THAT(faults_of("[api]\nevents = \"" + std::string(bad) + "\""), ElementsAre(HasSubstr("ipc:///PATH")))
+        << bad;
+  EXPECT_THAT(faults_of("[api]\nevents = \"ipc:///" + std::string(200, 'x') + "\""), ElementsAre(HasSubstr("107")));
+  EXPECT_THAT(faults_of("[api]\nevents = \"ipc:///a\"\ncontrol = \"ipc:///a\""),
+              ElementsAre(HasSubstr("another endpoint")));
+}
+
+TEST(ParseConfig, SaysWhereTheTextStopsBeingToml) {
+  EXPECT_THAT(faults_of("[booth]\nname = = 3\n"), ElementsAre(AllOf(testing::StartsWith("line 2, column "),
+                                                                    HasSubstr("is not TOML"), Not(HasSubstr("\n")))));
+  EXPECT_THAT(faults_of("[jobs]\nworkers = 1\nworkers = 2\n"), ElementsAre(HasSubstr("is not TOML")));
+  EXPECT_THAT(faults_of(std::string(100000, '[')), ElementsAre(HasSubstr("is not TOML")));
+  EXPECT_THAT(faults_of("\xff\xfe"), ElementsAre(HasSubstr("is not TOML")));
+}
+
+TEST(ParseConfig, AnyDamageGivesOneLineAFault) {
+  const std::string whole = with_examples(text_of(default_file));
+  std::mt19937 random(3);
+  for (int round = 0; round < 500; ++round) {
+    std::string damaged = whole;
+    for (int i = 0; i <= round % 5; ++i) damaged[random() % damaged.size()] = static_cast<char>(random());
+    if (round % 3 == 0) damaged.resize(random() % damaged.size());
+    for (const std::string& fault : faults_of(damaged)) {
+      EXPECT_THAT(fault, Not(HasSubstr("\n")));
+      EXPECT_LT(fault.size(), 600U);
+    }
+  }
+}
+
+TEST(LoadConfig, NamesTheFileInEveryLine) {
+  const ScratchFolder scratch;
+  const fs::path file = scratch.path() / "boothd.toml";
+  EXPECT_EQ(load_config(file).error().code, ErrorCode::not_found);
+  EXPECT_THAT(load_config(file).error().message, HasSubstr(file.string()));
+  std::ofstream(file) << "[jobs]\nworkers = 0\nretries = 99\n[replay]\nrecording = \"rec\"\n";
+  const auto refused = load_config(file);
+  ASSERT_FALSE(refused);
+  EXPECT_EQ(refused.error().code, ErrorCode::invalid_file);
+  EXPECT_EQ(refused.error().message, file.string() + ": jobs.workers: 0, expected 1 … 64\n" + file.string() +
+                                         ": jobs.retries: 99, expected 0 … 10");
+  std::ofstream(file) << "[replay]\nrecording = \"rec\"\n";
+  EXPECT_EQ(load_config(file)->replay.recording, scratch.path() / "rec");
+}
+
+}  // namespace
+}  // namespace booth
