@@ -92,8 +92,10 @@ class EdgeQueue {
     constexpr int dropped_bits = 19;  // of a float's 23 bits of mantissa
     return std::bit_cast<uint32_t>(cost > 0 ? cost : 0.0F) >> dropped_bits;
   }
-  void push(float cost, const Entry& entry) {
-    const size_t bucket = bucket_of(cost);
+  static constexpr size_t fourfold = 32;  ///< that many buckets on, costs are four times as large
+
+  void push(size_t bucket, const Entry& entry) {
+    bucket = std::min(bucket, buckets_.size() - 1);
     buckets_[bucket].entries.push_back(entry);
     lowest_ = std::min(lowest_, bucket);
   }
@@ -111,6 +113,7 @@ class EdgeQueue {
     }
     return false;
   }
+  size_t buckets() const { return buckets_.size(); }
 
  private:
   struct Bucket {
@@ -234,17 +237,16 @@ class Decimation {
     return q;
   }
 
-  float cost(uint32_t half) const {
-    const Quadric q = edge_quadric(half);
-    return static_cast<float>(q.at(-Inverse(q).times(q.b)));
-  }
+  /// The least error of a vertex that takes the place of both ends.
+  static float cost(const Quadric& q, const Eigen::Vector3d& target) { return static_cast<float>(q.at(target)); }
 
   void queue(uint32_t half) {
     const uint32_t twin = twin_[half];
     if (twin == none || locked_[from(half)] || locked_[to(half)]) return;
     ++stamp_[half];
     ++stamp_[twin];
-    queue_.push(cost(half), {half, stamp_[half]});
+    const Quadric q = edge_quadric(half);
+    queue_.push(EdgeQueue::bucket_of(cost(q, -Inverse(q).times(q.b))), {half, stamp_[half]});
   }
 
   void queue_all() {
@@ -256,16 +258,27 @@ class Decimation {
   void collapse_until(size_t budget) {
     EdgeQueue::Entry entry{};
     size_t bucket = 0;
-    constexpr size_t between_looks = 4096;  // collapses between two looks at the stop token
+    constexpr size_t between_looks = 4096;  // edges between two looks at the stop token
     for (size_t pops = 0; alive_ > budget && queue_.pop(entry, bucket); ++pops) {
       if (pops % between_looks == 0 && work_.stopped()) return;
       if (dead(entry.half) || stamp_[entry.half] != entry.stamp) continue;
-      if (Eigen::Vector3d target; may_collapse(entry.half, target)) collapse(entry.half, target);
+      // A collapse only raises the costs around it, so that they need not be known before their old value is up.
+      const Quadric q = edge_quadric(entry.half);
+      const Inverse inverse(q);
+      Eigen::Vector3d target = -inverse.times(q.b);
+      if (const size_t now = EdgeQueue::bucket_of(cost(q, target)); now > bucket) {
+        queue_.push(now, entry);
+        continue;
+      }
+      if (may_collapse(entry.half, inverse, target))
+        collapse(entry.half, target);
+      else if (bucket + EdgeQueue::fourfold < queue_.buckets())
+        queue_.push(bucket + EdgeQueue::fourfold, entry);  // tried again when the mesh around it has changed
     }
   }
 
-  /// Where the edge's vertex would go, and whether the surface stays a manifold and does not fold there.
-  bool may_collapse(uint32_t half, Eigen::Vector3d& target) {
+  /// Moves the target to where it keeps the volume, and says whether the surface stays a manifold and does not fold.
+  bool may_collapse(uint32_t half, const Inverse& inverse, Eigen::Vector3d& target) {
     const uint32_t u = from(half), v = to(half), back = twin_[half];
     // Link condition (Dey et al.): the ends share no neighbour but the two that lie opposite the edge.
     ring_.clear();
@@ -295,9 +308,6 @@ class Decimation {
     for_each_spoke(back, [&](uint32_t spoke) {
       if (spoke / 3 != half / 3 && spoke / 3 != back / 3) add(spoke);
     });
-    const Quadric q = edge_quadric(half);
-    const Inverse inverse(q);
-    target = -inverse.times(q.b);
     const Eigen::Vector3d way = inverse.times(gradient);
     const double per_way = gradient.dot(way);
     const Eigen::Vector3d correction = way * ((volume - gradient.dot(target)) / per_way);
@@ -320,20 +330,19 @@ class Decimation {
     moved_.clear();
     for_each_spoke(back, [&](uint32_t spoke) { moved_.push_back(spoke); });
     for (const uint32_t spoke : moved_) triangles_[spoke / 3][spoke % 3] = u;
-    uint32_t survivor = none;
-    for (const uint32_t side : {half, back}) {
-      const uint32_t a = twin_[next(side)], b = twin_[previous(side)];
+    std::array<uint32_t, 2> joined{};  // the two edges that each pair of edges beside the collapsed one became
+    size_t count = 0;
+    for (const uint32_t edge : {half, back}) {
+      const uint32_t a = twin_[next(edge)], b = twin_[previous(edge)];
       twin_[a] = b;
       twin_[b] = a;
-      triangles_[side / 3] = {none, none, none};
-      survivor = from(a) == u ? a : b;
+      triangles_[edge / 3] = {none, none, none};
+      joined[count++] = a;
     }
     alive_ -= 2;
     positions_[u] = target;
     quadrics_[u] += quadrics_[v];
-    moved_.clear();
-    for_each_spoke(survivor, [&](uint32_t spoke) { moved_.push_back(spoke); });
-    for (const uint32_t spoke : moved_) queue(spoke);
+    for (const uint32_t edge : joined) queue(edge);
   }
 
   Mesh compact() const {
