@@ -22,9 +22,19 @@ Eigen::Vector2d distort(const std::array<double, 5>& d, const Eigen::Vector2d& p
   return {x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y};
 }
 
-/// The radius r (1 + k1 r² + k2 r⁴ + k3 r⁶) must grow with r, or a far point lands inside the image.
+/// The distorted radius r (1 + k1 r² + k2 r⁴ + k3 r⁶) must grow all the way from the axis to r, or a far point lands
+/// inside the image. It does while its derivative 1 + a s + b s² + c s³ by s = r² has no zero there.
 bool before_fold(const std::array<double, 5>& d, double r2) {
-  return 1 + r2 * (3 * d[0] + r2 * (5 * d[1] + r2 * 7 * d[4])) > 0;
+  const double a = 3 * d[0], b = 5 * d[1], c = 7 * d[4];
+  if (1 - r2 * (std::abs(a) + r2 * (std::abs(b) + r2 * std::abs(c))) > 0) return true;  // no terms could do it: usual
+  const auto grows = [&](double s) { return 1 + s * (a + s * (b + s * c)) > 0; };
+  if (!grows(r2)) return false;
+  // It may have folded and unfolded again: look where the derivative is least, at a zero of a + 2 b s + 3 c s².
+  const double discriminant = b * b - 3 * a * c;
+  if (discriminant < 0) return true;
+  const double q = -(b + std::copysign(std::sqrt(discriminant), b));
+  const auto grows_at = [&](double s) { return !(s > 0 && s < r2) || grows(s); };  // NaN and infinity are no zeros
+  return grows_at(q / (3 * c)) && grows_at(a / q);
 }
 
 }  // namespace

@@ -20,10 +20,11 @@ struct Work {
   /// one piece is thrown again on the caller. Empty: serial. See pipeline/thread_pool.h.
   std::function<void(size_t count, size_t grain, const Range& body)> parallel;
 
-  /// Splits [0, count) into pieces of at most `grain` and runs them in any order. Pieces may not depend on each
-  /// other; the split depends on count and grain only, never on the number of threads.
+  /// Splits [0, count) into pieces of at most `grain` (0 is taken as 1) and runs them in any order. Pieces may not
+  /// depend on each other; the split depends on count and grain only, never on the number of threads.
   void parallel_for(size_t count, size_t grain, const Range& body) const {
     if (count == 0) return;
+    if (grain == 0) grain = 1;
     if (parallel) return parallel(count, grain, body);
     for (size_t begin = 0; begin < count; begin += grain) body(begin, begin + grain < count ? begin + grain : count);
   }
