@@ -19,7 +19,8 @@ constexpr float background_evidence = 4;
 constexpr float largest_evidence = 12;
 /// Beyond this a cell is subject whatever its neighbours say, but for noise.
 constexpr float clear_subject = 3;
-/// What a cell says that is darker than the background by what a soft shadow could take: next to nothing. Its
+/// What a cell says that is darker than the background by what a soft shadow could take, or lighter by what bounced
+/// light could add: next to nothing. Its
 /// boundary decides: shadows fade in, things have edges.
 constexpr float shadow_evidence = 0.05F;
 /// Evidence within ± this leaves a cell's patch to be judged by its rim, which then says so much per cell. A rim's
@@ -30,10 +31,10 @@ constexpr float no_edge = 0.6F;
 /// Bounced light tints the background by this much (lightness differences between channels), shadows by more.
 constexpr float tint = 0.02F;
 constexpr float tint_in_shadow = 0.08F;
-/// Bounced light brightens by this much at most, as a standard deviation.
-constexpr float brightening = 0.025F;
-/// A loss of lightness up to this is not even noticed.
-constexpr float unnoticed_shadow = 0.03F;
+/// Bounced light brightens by this much at most.
+constexpr float brightest_glow = 0.08F;
+/// A change of lightness up to this is not even noticed.
+constexpr float unnoticed_change = 0.03F;
 
 /// How exactly shadows and drift keep the background's texture, in lightness.
 constexpr float kept_texture = 0.012F;
@@ -76,15 +77,13 @@ class Evidence {
 
  private:
   float of_lightness(float lightness, float variance) const {
-    if (lightness > 0) {
-      return 0.5F * lightness * lightness / (variance + brightening * brightening) - background_evidence;
-    }
-    const float noticed = std::max(0.0F, -lightness - unnoticed_shadow);
-    const float spread = variance + 0.25F * unnoticed_shadow * unnoticed_shadow;
+    const float change = std::abs(lightness);
+    const float noticed = std::max(0.0F, change - unnoticed_change);
+    const float spread = variance + 0.25F * unnoticed_change * unnoticed_change;
     const float rising = std::min(0.5F * noticed * noticed / spread - background_evidence, shadow_evidence);
-    // Beyond the deepest shadow the evidence rises again, as fast as it fell short of it.
-    const float beyond = std::max(0.0F, -lightness / deepest_ - 1);
-    return rising + background_evidence * beyond / 0.5F;
+    // Beyond the deepest shadow or the brightest glow the evidence rises again.
+    const float beyond = std::max(0.0F, change / (lightness < 0 ? deepest_ : brightest_glow) - 1);
+    return rising + 2 * background_evidence * beyond;
   }
 
   const Residual& residual_;

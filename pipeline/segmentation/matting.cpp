@@ -28,6 +28,8 @@ constexpr float doubtful_contrast = 0.015F;
 /// to a surface of its own.
 constexpr float strange_lightness = 0.12F;
 constexpr float strange_hue = 0.25F;
+/// How many standard deviations of noise weigh as much as the light itself.
+constexpr float strange_noise = 10;
 /// Keeps quotients of two black surfaces near 1.
 constexpr float dark = 2e-3F;
 
@@ -122,6 +124,7 @@ class Matte {
         subject_(subject),
         linear_(linear_light_table()),
         channels_(body.channels),
+        step_(grid.step),
         band_(grid, body.width, body.height, subject, static_cast<int>(std::ceil(band_px)) + grid.step),
         empty_(band_.pixels()),
         alpha_(band_.pixels()),
@@ -252,16 +255,22 @@ class Matte {
   /// both by more than bounced light makes, or of another hue. So are highlights along the rim of skin and hair.
   float strangeness(int x, int y, int32_t i, const Crossing& crossing, float mixed) const {
     Color excess{};
-    float lighter = 0;
+    float lighter = 0, light = 0, noise = 0;
+    const size_t cell = band_.cell(x, y);
     for (int c = 0; c < channels_; ++c) {
       const float empty = empty_[i][c] * crossing.gain[c];
       const float expected = empty + mixed * (crossing.subject[c] - empty);
-      excess[c] = (linear_[body_.at(x, y, c)] - expected) / (empty + dark);
+      excess[c] = linear_[body_.at(x, y, c)] - expected;
       lighter += excess[c] / static_cast<float>(channels_);
+      light += empty / static_cast<float>(channels_);
+      noise = std::max(noise, residual_.variance.values[c][cell]);
     }
+    // Noise of lightness as a share of linear light, for a pixel: a cell averages step² of them.
+    const float noisy = srgb_exponent * std::sqrt(noise) * static_cast<float>(step_);
+    const float unit = light * (1 + strange_noise * noisy) + dark;
     float hue = 0;
     for (int c = 0; c < channels_; ++c) hue = std::max(hue, std::abs(excess[c] - lighter));
-    const float strange = std::max(lighter / strange_lightness, hue / strange_hue);
+    const float strange = std::max(lighter / strange_lightness, hue / strange_hue) / unit;
     return std::clamp(strange - 0.5F, 0.0F, 1.0F);
   }
 
@@ -288,6 +297,7 @@ class Matte {
   const CellMask& subject_;
   std::array<float, 256> linear_;
   int channels_;
+  int step_;
   Band band_;
   std::vector<Color> empty_;  ///< the empty booth in linear light
   std::vector<float> alpha_;
