@@ -17,6 +17,10 @@ namespace booth {
 namespace {
 
 constexpr uint64_t most_pixels = 100'000'000;
+// What can at most come out of a byte of the file, so that a short one cannot make us fill memory for a huge picture:
+// deflate's longest match is 258 bytes in 2 bits; each 8 × 8 block of a JPEG takes a bit or more in its first scan.
+constexpr uint64_t most_png_bytes_a_byte = 1032;
+constexpr uint64_t most_jpeg_pixels_a_byte = 64 * 8;
 constexpr uint8_t png_signature[] = {0x89, 'P', 'N', 'G', '\r', '\n', 0x1a, '\n'};
 
 Error damaged(const std::string& what) { return {ErrorCode::invalid_file, what}; }
@@ -40,10 +44,11 @@ Result<void> check_size(uint64_t width, uint64_t height) {
 struct PngReader {
   png_structp png = nullptr;
   png_infop info = nullptr;
+  uint64_t size;  ///< of the whole file, bytes
   std::span<const uint8_t> rest;
   std::string fault;
 
-  explicit PngReader(std::span<const uint8_t> bytes) : rest(bytes) {
+  explicit PngReader(std::span<const uint8_t> bytes) : size(bytes.size()), rest(bytes) {
     png = png_create_read_struct(PNG_LIBPNG_VER_STRING, this, on_error, on_warning);
     if (png != nullptr) info = png_create_info_struct(png);
     if (info == nullptr) throw std::bad_alloc();
@@ -87,9 +92,11 @@ bool read_png(PngReader& reader, ImageHeader* header, Image* image, std::vector<
   header->height = static_cast<int>(png_get_image_height(reader.png, reader.info));
   if (static_cast<uint64_t>(header->width) * static_cast<uint64_t>(header->height) > most_pixels)
     png_error(reader.png, "has more than 100 million pixels");
+  const uint64_t content = uint64_t{png_get_rowbytes(reader.png, reader.info)} * static_cast<uint64_t>(header->height);
   request_plain_samples(reader);
   header->channels = png_get_channels(reader.png, reader.info);
   if (image == nullptr) return true;
+  if (content > reader.size * most_png_bytes_a_byte) png_error(reader.png, "ends early");
   *image = Image(header->width, header->height, header->channels);
   rows->resize(static_cast<size_t>(header->height));
   for (int y = 0; y < header->height; ++y) (*rows)[static_cast<size_t>(y)] = image->pixel(0, y);
@@ -120,10 +127,15 @@ Result<Image> decode_jpeg(std::span<const uint8_t> bytes) {
   if (!turbo) throw std::bad_alloc();
   const auto header = jpeg_header(turbo.get(), bytes);
   if (!header) return header.error();
+  if (static_cast<uint64_t>(header->width) * static_cast<uint64_t>(header->height) >
+      bytes.size() * most_jpeg_pixels_a_byte)
+    return damaged("ends early");
   Image image(header->width, header->height, header->channels);
   // TJFLAG_STOPONWARNING: a truncated file is a fault, not a picture whose lower part is grey.
+  // TJFLAG_LIMITSCANS: no file can keep us busy by repeating scans.
   if (tjDecompress2(turbo.get(), bytes.data(), bytes.size(), image.samples.data(), image.width, 0, image.height,
-                    image.channels == 1 ? TJPF_GRAY : TJPF_RGB, TJFLAG_STOPONWARNING | TJFLAG_ACCURATEDCT) != 0)
+                    image.channels == 1 ? TJPF_GRAY : TJPF_RGB,
+                    TJFLAG_STOPONWARNING | TJFLAG_LIMITSCANS | TJFLAG_ACCURATEDCT) != 0)
     return damaged(tjGetErrorStr2(turbo.get()));
   return image;
 }
@@ -269,6 +281,7 @@ std::vector<uint8_t> encode_png(const Image& image, int level) {
 
 std::vector<uint8_t> encode_jpeg(const Image& image, int quality) {
   if (image.channels != 1 && image.channels != 3) throw std::invalid_argument("encode_jpeg: needs 1 or 3 channels");
+  if (image.empty()) throw std::invalid_argument("encode_jpeg: needs an image with pixels");
   const Turbo turbo(tjInitCompress());
   if (!turbo) throw std::bad_alloc();
   const bool grey = image.channels == 1;

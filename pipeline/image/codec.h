@@ -35,7 +35,7 @@ Result<Image> decode_image(std::span<const uint8_t> bytes);
 /// Source: W3C, "Portable Network Graphics (PNG) Specification (Second Edition)", 2003.
 std::vector<uint8_t> encode_png(const Image& image, int level = 6);
 
-/// @param image    1 or 3 channels
+/// @param image    1 or 3 channels, not empty
 /// @param quality  1 … 100; colour is not subsampled from 90 on
 std::vector<uint8_t> encode_jpeg(const Image& image, int quality = 92);
 
