@@ -9,7 +9,6 @@
 #include "pipeline/atlas/colour_balance.h"
 #include "pipeline/atlas/packing.h"
 #include "pipeline/atlas/push_pull.h"
-#include "pipeline/atlas/unfolding.h"
 
 namespace booth {
 namespace {
@@ -69,9 +68,8 @@ double seen_share(const Mesh& mesh, const CameraRatings& ratings) {
 Packing lay_out(const Mesh& mesh, const AtlasOptions& options, const Work& work) {
   double area = 0;
   for (size_t t = 0; t < mesh.triangles.size(); ++t) area += triangle_area(mesh, t);
-  UnfoldingOptions unfolding;
-  unfolding.clearance_m = clearance_texels * std::sqrt(area) / options.size;
-  const std::vector<Chart> charts = unfold(mesh, {}, unfolding);
+  const double texel_m = std::sqrt(area) / options.size;
+  const std::vector<Chart> charts = cut_into_charts(mesh, options.charting, clearance_texels * texel_m, work);
   const std::vector<double> density(charts.size(), 1.0);
   return pack_charts(charts, mesh.triangles.size(), density, options.size, options.gutter_texels, work);
 }

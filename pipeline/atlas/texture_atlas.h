@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "pipeline/atlas/blending.h"
+#include "pipeline/atlas/charting.h"
 #include "pipeline/atlas/input_preparation.h"
 #include "pipeline/types/avatar.h"
 #include "pipeline/types/frame.h"
@@ -17,6 +18,7 @@ namespace booth {
 struct AtlasOptions {
   int size = 2048;                                ///< width and height of the atlas, texels, 256 … 8192
   int gutter_texels = 4;                          ///< least distance between charts, 0 … 32
+  Charting charting = Charting::flattening;       ///< unfolding is the paper's
   Inpainting inpainting = Inpainting::push_pull;  ///< Telea's is the paper's
   Blending blending = Blending::best_view;        ///< rating_mean is the paper's
   bool balance_colours = true;                    ///< removes differences of gain and white balance between cameras
@@ -31,7 +33,7 @@ struct TextureAtlas {
 
 /// One view-independent texture, blended from every camera that sees a texel.
 ///
-/// The surface is unfolded into charts without distortion and packed; every camera is rated at every vertex; texels
+/// The surface is cut into charts and packed; every camera is rated at every vertex; texels
 /// blend the cameras' colours in linear light. Where no camera looks, colours spread over the surface; unused
 /// texels continue their surroundings, so that smaller mip levels do not bleed.
 ///
