@@ -67,6 +67,12 @@ Result<void> check(std::span<const Frame> background, const Frame& body) {
   return {};
 }
 
+double covered_share(const Image& coverage) {
+  uint64_t sum = 0;
+  for (const uint8_t v : coverage.samples) sum += v;
+  return static_cast<double>(sum) / 255 / static_cast<double>(coverage.samples.size());
+}
+
 /// Share of the image's border pixels that are subject.
 double border_share(const Image& coverage) {
   size_t covered = 0;
@@ -119,16 +125,17 @@ Result<Segmentation> segment(std::span<const Frame> background, const Frame& bod
                                                       {.darkest_shadow = options.darkest_shadow,
                                                        .smoothness = options.smoothness,
                                                        .smallest_part = options.smallest_part});
-  Segmentation result;
-  result.subject_share = static_cast<double>(labeling.subject_cells) / static_cast<double>(model.grid.count());
-  if (labeling.subject_cells == 0 || result.subject_share < options.smallest_subject) {
+  const double share = static_cast<double>(labeling.subject_cells) / static_cast<double>(model.grid.count());
+  if (labeling.subject_cells == 0 || share < options.smallest_subject) {
     return Error{ErrorCode::no_subject, "camera " + body.camera + ": nobody stands before the background"};
   }
   if (work.stopped()) return Work::cancelled();
   work.report(0.8);
 
+  Segmentation result;
   result.silhouette.camera = body.camera;
   result.silhouette.coverage = segmentation::matte(background, *body.pixels, model.grid, residual, labeling.subject);
+  result.subject_share = covered_share(result.silhouette.coverage);
   result.warnings = find_warnings(residual, labeling, result, body.camera);
   work.report(1);
   return result;
