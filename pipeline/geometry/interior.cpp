@@ -245,11 +245,13 @@ double Interior::depth(const Eigen::Vector3d& p) const {
 
 Interior sample_interior(const Mesh& mesh, int cells) {
   Eigen::AlignedBox3d box;
-  for (const Eigen::Vector3f& p : mesh.positions) box.extend(p.cast<double>());
+  for (const auto& t : mesh.triangles)
+    for (const uint32_t v : t) box.extend(mesh.positions[v].cast<double>());
   Interior interior;
   Grid& grid = interior.grid;
   // Samples lie symmetrically about the box's middle, so that the mirrored mesh has the mirrored voxels.
-  grid.voxel_m = box.sizes().y() / cells;
+  if (box.isEmpty() || !(box.sizes().maxCoeff() > 0)) return interior;
+  grid.voxel_m = std::max({box.sizes().y(), 0.5 * box.sizes().x(), box.sizes().z()}) / cells;
   for (int axis = 0; axis < 3; ++axis) {
     const int half = static_cast<int>(std::ceil(0.5 * box.sizes()[axis] / grid.voxel_m)) + margin;
     grid.size[static_cast<size_t>(axis)] = 2 * half + 1;

@@ -31,8 +31,8 @@ struct Interior {
 
 /// Samples the mesh's inside (non-zero winding number along z), keeps the largest connected part and measures depths.
 ///
-/// @param mesh   closed, world frame, at least one triangle; its parts may overlap
-/// @param cells  voxels along the mesh's height
+/// @param mesh   closed, world frame; its parts may overlap
+/// @param cells  voxels along the mesh's height; fewer where it is more than twice as wide or deeper than tall
 /// @return no voxels inside when the mesh encloses nothing
 /// Cost: O(voxels). Source of the distances: P. Felzenszwalb, D. Huttenlocher, "Distance transforms of sampled
 /// functions", Theory of Computing 8, 2012.

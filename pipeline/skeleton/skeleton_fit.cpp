@@ -180,25 +180,46 @@ Vector3d pulled_inside(const Body& body, const Vector3d& p) {
 
 // ---- the body and its ends -----------------------------------------------------------------------------------------
 
+Eigen::AlignedBox3d bounds(const Interior& interior) {
+  Eigen::AlignedBox3d box;
+  for (const uint32_t v : interior.inside) box.extend(interior.point(v));
+  box.min().array() -= 0.5 * interior.grid.voxel_m;
+  box.max().array() += 0.5 * interior.grid.voxel_m;
+  return box;
+}
+
+/// What of a mesh lies within a box.
+Mesh cropped(const Mesh& mesh, const Eigen::AlignedBox3d& box) {
+  Mesh result{mesh.positions, {}};
+  for (const auto& t : mesh.triangles)
+    if (std::all_of(t.begin(), t.end(), [&](uint32_t v) { return box.contains(mesh.positions[v].cast<double>()); }))
+      result.triangles.push_back(t);
+  return result;
+}
+
 Result<Body> measure(const Mesh& mesh, const SkeletonOptions& options) {
-  Eigen::AlignedBox3f box;
-  for (const Eigen::Vector3f& p : mesh.positions) box.extend(p);
-  // People are taller than wide even in a T-pose with shoes off, and several times taller than deep.
-  const Eigen::Vector3f size = box.sizes();
-  if (mesh.triangles.empty() || !(size.y() > 0)) return not_riggable("the mesh is empty");
-  if (size.x() > 1.5F * size.y() || size.z() > size.y())
-    return not_riggable("the shape is wider or deeper than a standing person is tall");
+  if (mesh.triangles.empty()) return not_riggable("the mesh is empty");
   Body body;
   body.interior = sample_interior(mesh, options.cells);
   if (body.interior.inside.empty()) return not_riggable("the mesh encloses nothing");
-  int low = body.interior.grid.size[1], high = 0;
-  for (const uint32_t v : body.interior.inside) {
-    const int j = body.interior.cell(v)[1];
-    low = std::min(low, j);
-    high = std::max(high, j);
+  Eigen::AlignedBox3d box = bounds(body.interior);
+  constexpr double fine_enough = 0.9;
+  if (box.sizes().y() < fine_enough * options.cells * body.voxel()) {
+    // The body is a small part of the mesh: sample it alone.
+    const Vector3d margin = Vector3d::Constant(2 * body.voxel());
+    body.interior = sample_interior(cropped(mesh, {box.min() - margin, box.max() + margin}), options.cells);
+    if (body.interior.inside.empty()) return not_riggable("the mesh encloses nothing");
+    box = bounds(body.interior);
   }
-  body.floor = body.row_y(low) - 0.5 * body.voxel();
-  body.stature = (high - low + 1) * body.voxel();
+  body.floor = box.min().y();
+  body.stature = box.sizes().y();
+  // People are as tall as their arms span, and several times taller than deep. An adult of 100 kg and 1.6 m fills 0.025
+  // of the cube over the stature; a coat and a coarse hull may double that.
+  constexpr double widest = 1.4, deepest = 0.8, most_massive = 0.08;
+  if (box.sizes().x() > widest * body.stature || box.sizes().z() > deepest * body.stature)
+    return not_riggable("the shape is wider or deeper than a standing person is tall");
+  const double volume = static_cast<double>(body.interior.inside.size()) * std::pow(body.voxel(), 3);
+  if (volume > most_massive * std::pow(body.stature, 3)) return not_riggable("the shape is too massive for a person");
   return body;
 }
 
@@ -393,31 +414,37 @@ double wrist_along(const std::vector<Station>& line, double arm_length) {
   return 0.5 * (expected + line[narrowest].along);
 }
 
-/// The bend of the arm: the station E for which the straight pieces wrist–E–shoulder follow the centre line best,
-/// weighed against the proportions of the arm.
-size_t elbow_station(const Body& body, const std::vector<Station>& line, double wrist) {
+/// The bend of the arm: the place E for which the straight pieces wrist–E–shoulder follow the centre line best, weighed
+/// against the proportions of the arm. The centre line rounds the corner, so E may lie somewhat outside of it.
+Vector3d find_elbow(const Body& body, const std::vector<Station>& line, double wrist) {
   const double arm_length = line.back().along;
   const double expected = hand_of_arm + forearm_of_arm;
   const double tolerance = 0.005 * body.stature;
   size_t first = 0;
   while (first + 1 < line.size() && line[first].along < wrist) ++first;
+  const Vector3d from = line[first].p, to = line.back().p;
   double least = std::numeric_limits<double>::infinity();
-  size_t best = first;
-  for (size_t e = first + 1; e + 1 < line.size(); ++e) {
-    const double share = line[e].along / arm_length;
-    if (share < 0.48 || share > 0.75) continue;
-    double misfit = 0;
-    for (size_t s = first; s < line.size(); ++s) {
-      const double d = s < e ? distance_to_segment(line[s].p, line[first].p, line[e].p)
-                             : distance_to_segment(line[s].p, line[e].p, line.back().p);
-      misfit += d * d;
-    }
-    misfit /= static_cast<double>(line.size() - first) * tolerance * tolerance;
-    const double unusual = (share - expected) / 0.025;
-    const double cost = misfit + unusual * unusual;
-    if (cost < least) {
-      least = cost;
-      best = e;
+  Vector3d best = point_along(line, expected * arm_length);
+  for (double share = 0.48; share < 0.75; share += 0.005) {
+    if (share * arm_length <= line[first].along) continue;
+    const Vector3d on_line = point_along(line, share * arm_length);
+    const double t = std::clamp((on_line - from).dot(to - from) / (to - from).squaredNorm(), 0.0, 1.0);
+    const Vector3d bow = on_line - from - t * (to - from);
+    for (const double outside : {0.0, 0.1, 0.2, 0.3, 0.4}) {
+      const Vector3d elbow = on_line + outside * bow;
+      double misfit = 0;
+      for (size_t s = first; s < line.size(); ++s) {
+        const double d =
+            std::min(distance_to_segment(line[s].p, from, elbow), distance_to_segment(line[s].p, elbow, to));
+        misfit += d * d;
+      }
+      misfit /= static_cast<double>(line.size() - first) * tolerance * tolerance;
+      const double unusual = (share - expected) / 0.025;
+      const double cost = misfit + unusual * unusual;
+      if (cost < least) {
+        least = cost;
+        best = elbow;
+      }
     }
   }
   return best;
@@ -481,7 +508,7 @@ ArmJoints trace_arm(const Body& body, const std::vector<uint32_t>& limb, const s
     }
     const double wrist = wrist_along(whole, whole.back().along);
     arm.wrist = point_along(whole, wrist);
-    arm.elbow = whole[elbow_station(body, whole, wrist)].p;
+    arm.elbow = find_elbow(body, whole, wrist);
     elbow = arm.elbow;
   }
   return arm;
@@ -507,15 +534,24 @@ ArmJoints hanging_arm(const Body& body, const std::vector<double>& outline, doub
   return arm;
 }
 
-/// A leg's centre, row by row, from the floor to the crotch; rows without a centre are left out.
+/// A leg's centre, row by row, from the floor upwards; only rows that hold the leg's whole section, which ends where
+/// the limb does.
 std::vector<Vector3d> leg_rows(const Body& body, const std::vector<uint32_t>& limb, double top) {
-  std::vector<Centroid> rows(static_cast<size_t>(body.interior.grid.size[1]));
-  for (const uint32_t v : limb)
-    rows[static_cast<size_t>(body.interior.cell(v)[1])].add(
-        body.interior.point(v), centre_weight(static_cast<double>(body.interior.depth_m[v])));
+  const size_t count = static_cast<size_t>(body.interior.grid.size[1]);
+  std::vector<Centroid> rows(count);
+  std::vector<bool> whole(count, true);
+  std::vector<bool> member(body.interior.depth_m.size(), false);
+  for (const uint32_t v : limb) member[v] = true;
+  const size_t plane = body.interior.index(0, 0, 1);
+  for (const uint32_t v : limb) {
+    const size_t row = static_cast<size_t>(body.interior.cell(v)[1]);
+    rows[row].add(body.interior.point(v), centre_weight(static_cast<double>(body.interior.depth_m[v])));
+    for (const size_t next : {v - size_t{1}, v + size_t{1}, v - plane, v + plane})
+      if (body.interior.depth_m[next] > 0 && !member[next]) whole[row] = false;
+  }
   std::vector<Vector3d> line;
-  for (const Centroid& row : rows)
-    if (row.weight > 0 && row.mean().y() < top) line.push_back(row.mean());
+  for (size_t row = 0; row < count; ++row)
+    if (rows[row].weight > 0 && whole[row] && rows[row].mean().y() < top) line.push_back(rows[row].mean());
   return line;
 }
 
@@ -581,6 +617,12 @@ struct NeckMeasure {
   bool seen = true;  // false: covered by hair or a hood
 };
 
+double middle_of_head(const Body& body, const Ends& ends) {
+  const double crown_x = body.interior.point(ends.head).x();
+  const Run run = run_at(body, body.height(0.95), crown_x);
+  return run.empty() ? crown_x : 0.5 * (run.low + run.high);
+}
+
 NeckMeasure find_neck(const Body& body, double x) {
   NeckMeasure neck{body.height(neck_height_share), false};
   double narrowest = std::numeric_limits<double>::infinity(), head = 0;
@@ -635,13 +677,12 @@ double hip_height(const Body& body, const NeckMeasure& neck, std::optional<doubl
   return body.height(0.7 * measured + 0.3 * usual);
 }
 
-TrunkJoints place_trunk(const Body& body, const Ends& ends, const NeckMeasure& neck, double hip_y, double hip_x) {
+TrunkJoints place_trunk(const Body& body, const Ends& ends, const NeckMeasure& neck, double head_x, double hip_y,
+                        double hip_x) {
   const double h = body.stature;
   const double head_height = body.height(1) - neck.y;
   TrunkJoints trunk;
-  const double crown_x = body.interior.point(ends.head).x();
-  const Run skull_run = run_at(body, body.height(1) - 0.4 * head_height, crown_x);
-  const double head_x = skull_run.empty() ? crown_x : 0.5 * (skull_run.low + skull_run.high);
+
   const Vector3d skull =
       centre_near(body, {head_x, body.height(1) - 0.4 * head_height, 0.5 * (body.interior.point(ends.head).z())},
                   {0.08 * h, 0.25 * head_height, h});
@@ -776,23 +817,24 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
   // Legs up to the crotch, and with it the height of the hips.
   std::array<std::vector<Vector3d>, 2> rows;
   std::optional<double> crotch;
-  double hip_x = body.interior.point(ends->head).x();
+
   if (feet) {
     for (const size_t side : {left, right}) rows[side] = leg_rows(body, limbs[*leg_limb[side]], body.height(0.6));
     crotch = where_legs_meet(body, rows[left], rows[right]);
     for (const size_t side : {left, right})
       std::erase_if(rows[side], [&](const Vector3d& p) { return p.y() > *crotch - 0.02 * body.stature; });
   }
-  const double head_x = body.interior.point(ends->head).x();
+  const double head_x = middle_of_head(body, *ends);
   const NeckMeasure neck = find_neck(body, head_x);
   if (!neck.seen) result.warnings.emplace_back("no neck was seen (long hair or a hood?); it was placed by proportions");
   const double hip_y = hip_height(body, neck, crotch, result.warnings);
+  double hip_x = head_x;
   if (const Run run = run_at(body, hip_y, hip_x); !run.empty()) {
     // The trunk's middle; arms that touch it there are cut off at what hips measure.
     const double half = 0.14 * body.stature;
     hip_x = 0.5 * (std::max(run.low, hip_x - half) + std::min(run.high, hip_x + half));
   }
-  TrunkJoints trunk = place_trunk(body, *ends, neck, hip_y, hip_x);
+  TrunkJoints trunk = place_trunk(body, *ends, neck, head_x, hip_y, hip_x);
 
   std::array<LegJoints, 2> legs;
   if (!feet)

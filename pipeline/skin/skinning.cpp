@@ -90,6 +90,18 @@ void shape_trunk(const Skeleton& skeleton, const std::vector<Eigen::Isometry3d>&
       if (static_cast<int>(bone.joint) == skeleton.find(name)) bone.from += inner_clavicle * (bone.to - bone.from);
 }
 
+/// The face goes with the head, chin included, which lies beside the neck: a second bone runs from the skull's base
+/// towards the chin.
+void add_jaw(const Skeleton& skeleton, const std::vector<Eigen::Isometry3d>& world, std::vector<Bone>& bones) {
+  constexpr double forward = 0.6, down = 0.25;  // of the length of the skull
+  const int head = skeleton.find("Head"), top = skeleton.find("HeadTop_End");
+  if (head < 0 || top < 0) return;
+  const Eigen::Isometry3d& base = world[static_cast<size_t>(head)];
+  const double length = (world[static_cast<size_t>(top)].translation() - base.translation()).norm();
+  bones.push_back(
+      {base.translation(), base * Vector3d(0, -down * length, forward * length), static_cast<size_t>(head)});
+}
+
 /// A vertex's bone and how far away that is.
 struct Attachment {
   size_t joint = 0;
@@ -255,6 +267,7 @@ Result<Skin> compute_skin(const Mesh& mesh, const Skeleton& skeleton, const Skin
   std::vector<Bone> bones = bones_of(skeleton, world, interior);
   if (bones.empty()) return Error{ErrorCode::invalid_argument, "skin: the skeleton has no bones"};
   shape_trunk(skeleton, world, bones);
+  add_jaw(skeleton, world, bones);
   const std::vector<Attachment> attachments = attach(mesh, interior, bones, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.3);
