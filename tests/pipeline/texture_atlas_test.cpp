@@ -1,0 +1,280 @@
+#include "pipeline/atlas/texture_atlas.h"
+
+#include <gtest/gtest.h>
+
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <cmath>
+#include <functional>
+#include <memory>
+#include <vector>
+
+#include "pipeline/geometry/camera_model.h"
+#include "pipeline/surface/marching_cubes.h"
+#include "pipeline/thread_pool.h"
+#include "tests/synthetic/body.h"
+#include "tests/synthetic/scene.h"
+
+namespace booth {
+namespace {
+
+struct Scene {
+  Mesh mesh;
+  Rig rig;
+  std::vector<Frame> frames;
+  std::vector<Silhouette> silhouettes;
+};
+
+using Paint = std::function<Eigen::Vector3d(const Eigen::Vector3d&)>;
+
+/// Photographs of the body in the given colours before a wall, one ray a pixel.
+Scene photographed(const synthetic::Body& body, const Paint& paint, double voxel_m, const synthetic::RigOptions& rig) {
+  Scene scene;
+  scene.mesh = extract_surface(synthetic::sample_field(body, voxel_m));
+  scene.rig = synthetic::ring_rig(rig);
+  for (const RigCamera& camera : scene.rig.cameras) {
+    auto image = std::make_shared<Image>(camera.intrinsics.width, camera.intrinsics.height, 3, uint8_t{190});
+    Silhouette silhouette{camera.id, Image(camera.intrinsics.width, camera.intrinsics.height, 1)};
+    for (int y = 0; y < image->height; ++y)
+      for (int x = 0; x < image->width; ++x) {
+        Eigen::Vector3d hit;
+        if (!synthetic::trace(body, camera.center(), world_ray(camera, Eigen::Vector2d(x, y)), &hit)) continue;
+        silhouette.coverage.at(x, y) = 255;
+        const Eigen::Vector3d colour = paint(hit);
+        for (int c = 0; c < 3; ++c) image->at(x, y, c) = static_cast<uint8_t>(std::lround(255 * colour[c]));
+      }
+    Frame frame;
+    frame.camera = camera.id;
+    frame.pixels = std::move(image);
+    scene.frames.push_back(std::move(frame));
+    scene.silhouettes.push_back(std::move(silhouette));
+  }
+  return scene;
+}
+
+Scene person_scene() {
+  return photographed(synthetic::person().body, synthetic::colour_at, 0.03,
+                      {.cameras = 6, .width = 270, .height = 360});
+}
+
+constexpr AtlasOptions small{.size = 512};
+
+TextureAtlas textured(const Scene& scene, const AtlasOptions& options = small, const Work& work = {}) {
+  auto result = build_texture_atlas(scene.mesh, scene.rig, scene.frames, scene.silhouettes, options, work);
+  EXPECT_TRUE(result.ok()) << (result.ok() ? "" : result.error().message);
+  return result.ok() ? std::move(result).value() : TextureAtlas{};
+}
+
+/// Bilinear, as a renderer does it; levels of 255.
+Eigen::Vector3d look_up(const Image& image, const Eigen::Vector2f& uv) {
+  const double x = std::clamp(static_cast<double>(uv.x()) * image.width - 0.5, 0.0, image.width - 1.001);
+  const double y = std::clamp(static_cast<double>(uv.y()) * image.height - 0.5, 0.0, image.height - 1.001);
+  const int i = static_cast<int>(x), j = static_cast<int>(y);
+  const double fx = x - i, fy = y - j;
+  Eigen::Vector3d colour;
+  for (int c = 0; c < 3; ++c)
+    colour[c] = (1 - fy) * ((1 - fx) * image.at(i, j, c) + fx * image.at(i + 1, j, c)) +
+                fy * ((1 - fx) * image.at(i, j + 1, c) + fx * image.at(i + 1, j + 1, c));
+  return colour;
+}
+
+struct Sample {
+  Eigen::Vector3d position, normal, colour;
+};
+/// The atlas at the triangles' middles.
+std::vector<Sample> middles(const Mesh& mesh, const Atlas& atlas) {
+  std::vector<Sample> samples;
+  for (size_t t = 0; t < mesh.triangles.size(); ++t) {
+    const auto p = [&](size_t k) { return mesh.positions[mesh.triangles[t][k]].cast<double>(); };
+    const Eigen::Vector2f uv = (atlas.uv[t][0] + atlas.uv[t][1] + atlas.uv[t][2]) / 3;
+    samples.push_back({(p(0) + p(1) + p(2)) / 3, (p(1) - p(0)).cross(p(2) - p(0)), look_up(atlas.image, uv)});
+  }
+  return samples;
+}
+
+/// Mean absolute difference to the true colours, weighted by area, after the one gain a channel that nobody can know.
+double mean_error(const Mesh& mesh, const Atlas& atlas, const Paint& paint, bool fit_gain = false) {
+  const std::vector<Sample> samples = middles(mesh, atlas);
+  Eigen::Array3d gain = Eigen::Array3d::Ones();
+  if (fit_gain) {
+    Eigen::Array3d found = Eigen::Array3d::Zero(), wanted = found;
+    for (const Sample& s : samples) {
+      found += s.normal.norm() * s.colour.array();
+      wanted += s.normal.norm() * 255 * paint(s.position).array();
+    }
+    gain = wanted / found;
+  }
+  double sum = 0, area = 0;
+  for (const Sample& s : samples) {
+    sum += s.normal.norm() * (gain * s.colour.array() - 255 * paint(s.position).array()).abs().mean();
+    area += s.normal.norm();
+  }
+  return sum / area;
+}
+
+/// Levels of 255 between the two sides of all chart borders, mean over points.
+double seam_difference(const Mesh& mesh, const Atlas& atlas) {
+  const auto neighbours = triangle_neighbours(mesh);
+  double sum = 0, count = 0;
+  for (size_t t = 0; t < mesh.triangles.size(); ++t)
+    for (size_t k = 0; k < 3; ++k) {
+      const auto n = static_cast<size_t>(neighbours[t][k]);
+      const auto& other = mesh.triangles[n];
+      const auto corner = [&](uint32_t v) {
+        return static_cast<size_t>(std::find(other.begin(), other.end(), v) - other.begin());
+      };
+      const Eigen::Vector2f a = atlas.uv[t][k], b = atlas.uv[t][(k + 1) % 3];
+      const Eigen::Vector2f c = atlas.uv[n][corner(mesh.triangles[t][k])];
+      const Eigen::Vector2f d = atlas.uv[n][corner(mesh.triangles[t][(k + 1) % 3])];
+      if ((a - c).norm() < 1e-6F && (b - d).norm() < 1e-6F) continue;
+      for (const float s : {0.2F, 0.5F, 0.8F}) {
+        sum += (look_up(atlas.image, a + s * (b - a)) - look_up(atlas.image, c + s * (d - c))).cwiseAbs().mean();
+        ++count;
+      }
+    }
+  return count > 0 ? sum / count : 0;
+}
+
+class TextureAtlasOfAPerson : public testing::Test {
+ protected:
+  static void SetUpTestSuite() { scene_ = std::make_unique<Scene>(person_scene()); }
+  static void TearDownTestSuite() { scene_.reset(); }
+  static std::unique_ptr<Scene> scene_;
+};
+std::unique_ptr<Scene> TextureAtlasOfAPerson::scene_;
+
+TEST_F(TextureAtlasOfAPerson, HasTheirColoursWithoutSeams) {
+  for (const Charting charting : {Charting::unfolding, Charting::flattening}) {
+    AtlasOptions options = small;
+    options.charting = charting;
+    const TextureAtlas result = textured(*scene_, options);
+    EXPECT_LT(mean_error(scene_->mesh, result.atlas, synthetic::colour_at), 3.0);
+    EXPECT_LT(seam_difference(scene_->mesh, result.atlas), 1.0);
+    EXPECT_GT(result.seen_share, 0.9);
+    EXPECT_GT(result.used_share, 0.3);
+    for (const auto& triangle : result.atlas.uv)
+      for (const Eigen::Vector2f& uv : triangle) EXPECT_TRUE((uv.array() >= 0).all() && (uv.array() <= 1).all());
+  }
+}
+
+TEST_F(TextureAtlasOfAPerson, HasTheirColoursByThePapersMethodToo) {
+  const TextureAtlas result = textured(*scene_, {.size = 512,
+                                                 .charting = Charting::unfolding,
+                                                 .inpainting = Inpainting::telea,
+                                                 .blending = Blending::rating_mean,
+                                                 .balance_colours = false});
+  EXPECT_LT(mean_error(scene_->mesh, result.atlas, synthetic::colour_at), 5.0);
+}
+
+TEST_F(TextureAtlasOfAPerson, IsTheSameOnAnyNumberOfThreads) {
+  ThreadPool pool(3);
+  const TextureAtlas serial = textured(*scene_), parallel = textured(*scene_, small, pool.work());
+  EXPECT_EQ(serial.atlas.image.samples, parallel.atlas.image.samples);
+  EXPECT_EQ(serial.atlas.uv, parallel.atlas.uv);
+}
+
+TEST_F(TextureAtlasOfAPerson, DoesNotShowCamerasOfDifferentGain) {
+  Scene uneven = *scene_;
+  for (const size_t i : {size_t{1}, size_t{4}}) {
+    auto image = std::make_shared<Image>(*uneven.frames[i].pixels);
+    for (size_t s = 0; s < image->samples.size(); ++s)
+      image->samples[s] = static_cast<uint8_t>(image->samples[s] * (s % 3 == 0 ? 0.8 : 0.9));
+    uneven.frames[i].pixels = std::move(image);
+  }
+  AtlasOptions off = small;
+  off.balance_colours = false;
+  const double without = mean_error(uneven.mesh, textured(uneven, off).atlas, synthetic::colour_at, true);
+  const double with = mean_error(uneven.mesh, textured(uneven).atlas, synthetic::colour_at, true);
+  EXPECT_LT(with, 3.0);
+  EXPECT_LT(with, 0.6 * without);
+}
+
+TEST_F(TextureAtlasOfAPerson, GetsAlongWithMissingFramesAndSaysWhatDoesNotFit) {
+  Scene fewer = *scene_;
+  fewer.frames.erase(fewer.frames.begin() + 2);
+  fewer.silhouettes.erase(fewer.silhouettes.begin());
+  fewer.frames[2].pixels = std::make_shared<Image>(10, 10, 3);
+  fewer.frames.push_back({"unknown", 0, 0, 0, 0, 0, std::make_shared<Image>(10, 10, 3)});
+  const TextureAtlas result = textured(fewer);
+  ASSERT_EQ(result.warnings.size(), 1U);
+  EXPECT_NE(result.warnings[0].find(fewer.frames[2].camera), std::string::npos);
+  EXPECT_LT(mean_error(fewer.mesh, result.atlas, synthetic::colour_at), 20.0);
+}
+
+TEST_F(TextureAtlasOfAPerson, IsGreyFromGreyFrames) {
+  Scene grey = *scene_;
+  for (Frame& frame : grey.frames) {
+    auto image = std::make_shared<Image>(frame.pixels->width, frame.pixels->height, 1);
+    for (int y = 0; y < image->height; ++y)
+      for (int x = 0; x < image->width; ++x) image->at(x, y) = frame.pixels->at(x, y, 1);
+    frame.pixels = std::move(image);
+  }
+  const auto& samples = textured(grey).atlas.image.samples;
+  for (size_t i = 0; i < samples.size(); i += 3)
+    ASSERT_TRUE(samples[i] == samples[i + 1] && samples[i] == samples[i + 2]);
+}
+
+TEST_F(TextureAtlasOfAPerson, NeedsACameraThatSeesThem) {
+  const auto none = build_texture_atlas(scene_->mesh, scene_->rig, {}, scene_->silhouettes, small);
+  ASSERT_FALSE(none.ok());
+  EXPECT_EQ(none.error().code, ErrorCode::too_few_views);
+
+  Mesh elsewhere = scene_->mesh;
+  for (Eigen::Vector3f& p : elsewhere.positions) p.y() += 50;
+  const auto away = build_texture_atlas(elsewhere, scene_->rig, scene_->frames, scene_->silhouettes, small);
+  ASSERT_FALSE(away.ok());
+  EXPECT_EQ(away.error().code, ErrorCode::too_few_views);
+}
+
+TEST_F(TextureAtlasOfAPerson, RefusesBadOptionsAndMeshesAndStopsWhenAsked) {
+  const auto code = [&](const Mesh& mesh, const AtlasOptions& options, const Work& work = {}) {
+    const auto result = build_texture_atlas(mesh, scene_->rig, scene_->frames, scene_->silhouettes, options, work);
+    return result.ok() ? ErrorCode::internal : result.error().code;
+  };
+  EXPECT_EQ(code(scene_->mesh, {.size = 10}), ErrorCode::invalid_argument);
+  EXPECT_EQ(code(scene_->mesh, {.size = 512, .gutter_texels = -1}), ErrorCode::invalid_argument);
+  EXPECT_EQ(code({}, small), ErrorCode::invalid_argument);
+  Mesh broken = scene_->mesh;
+  broken.positions[0].x() = std::nanf("");
+  EXPECT_EQ(code(broken, small), ErrorCode::invalid_argument);
+  std::stop_source source;
+  source.request_stop();
+  Work stopped;
+  stopped.stop = source.get_token();
+  EXPECT_EQ(code(scene_->mesh, small, stopped), ErrorCode::cancelled);
+}
+
+// A red bar stands before a blue column; the front camera sees the bar where the column continues behind it.
+TEST(TextureAtlas, WhatStandsInFrontDoesNotPrintOnWhatIsBehind) {
+  const synthetic::Body body{{{0, 0.2, 0}, {0, 1.6, 0}, 0.2, 0.2}, {{0.05, 0.3, 0.4}, {0.05, 1.5, 0.4}, 0.04, 0.04}};
+  const auto is_bar = [](const Eigen::Vector3d& p) { return p.z() > 0.3; };
+  const Paint paint = [&](const Eigen::Vector3d& p) {
+    return is_bar(p) ? Eigen::Vector3d(0.9, 0.1, 0.1) : Eigen::Vector3d(0.1, 0.2, 0.8);
+  };
+  const Scene scene = photographed(body, paint, 0.025, {.cameras = 8, .width = 180, .height = 240});
+  const TextureAtlas result = textured(scene);
+  size_t wrong = 0, all = 0;
+  for (const Sample& s : middles(scene.mesh, result.atlas)) {
+    ++all;
+    if ((s.colour.x() > s.colour.z()) != is_bar(s.position)) ++wrong;
+  }
+  EXPECT_LT(static_cast<double>(wrong), 0.005 * static_cast<double>(all));
+}
+
+// Seen from one side only: the other side continues the colours around it.
+TEST(TextureAtlas, WhatNoCameraSeesIsFilledFromItsSurroundings) {
+  const synthetic::Body ball = synthetic::sphere(0.4);
+  const Paint paint = [](const Eigen::Vector3d& p) { return Eigen::Vector3d(0.3, 0.5 + 0.5 * p.y(), 0.2); };
+  Scene scene = photographed(ball, paint, 0.03, {.cameras = 8, .width = 180, .height = 240});
+  scene.frames.resize(2);  // in front and to the left
+  const TextureAtlas result = textured(scene);
+  EXPECT_LT(result.seen_share, 0.8);
+  for (const Sample& s : middles(scene.mesh, result.atlas)) {
+    ASSERT_NEAR(s.colour.x(), 255 * 0.3, 6);
+    ASSERT_NEAR(s.colour.y(), 255 * 0.7, 255 * 0.25);
+    ASSERT_NEAR(s.colour.z(), 255 * 0.2, 6);
+  }
+}
+
+}  // namespace
+}  // namespace booth
