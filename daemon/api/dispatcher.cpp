@@ -1,0 +1,241 @@
+#include "daemon/api/dispatcher.h"
+
+#include <algorithm>
+#include <exception>
+#include <utility>
+
+#include "daemon/api/event_codec.h"
+#include "daemon/api/json_values.h"
+#include "daemon/api/requests.h"
+#include "daemon/identifier.h"
+#include "daemon/reconstruct_job.h"
+
+namespace booth::api {
+namespace {
+
+using Json = nlohmann::json;
+
+constexpr int api_version = 1;
+
+Json to_json(const Job& job) {
+  return {{"id", job.id},
+          {"capture", job.id},
+          {"state", to_string(job.state)},
+          {"stage", text_or_null(job.stage)},
+          {"fraction", job.fraction},
+          {"error", job.error ? api::to_json(*job.error) : Json(nullptr)},
+          {"avatar", job.state == JobState::done ? Json(job.id) : Json(nullptr)}};
+}
+
+Json to_json(const std::vector<Job>& jobs) {
+  Json list = Json::array();
+  for (const Job& job : jobs) list.push_back(to_json(job));
+  return list;
+}
+
+Json to_json(const CameraStatus& camera) {
+  return {{"id", camera.id},
+          {"driver", camera.driver},
+          {"role", camera.role == CameraRole::face ? "face" : "body"},
+          {"state", to_string(camera.state)},
+          {"last_frame_age_s", camera.last_frame_age_s ? Json(*camera.last_frame_age_s) : Json(nullptr)},
+          {"frames", camera.frames},
+          {"dropped", camera.dropped},
+          {"message", text_or_null(camera.message)}};
+}
+
+/// @param name  what the interface calls the device's name: the projector's `id`, the trigger's `driver`
+Json to_json(const std::optional<DeviceStatus>& device, const char* name) {
+  if (!device) return nullptr;
+  return {{name, device->name}, {"state", to_string(device->state)}, {"message", text_or_null(device->message)}};
+}
+
+Answer unsupported(const std::string& what) {
+  return Error{ErrorCode::unsupported, what + " is not offered by this version"};
+}
+
+template <class Request>
+Answer unsupported_after(const Result<Request>& request, const std::string& what) {
+  return request ? unsupported(what) : request.error();
+}
+
+}  // namespace
+
+template <class Request>
+bool Dispatcher::refused(const Result<Request>& request, const Responder& respond) {
+  if (!request) respond(request.error());
+  return !request;
+}
+
+void Dispatcher::on_disk(const Responder& respond, std::function<Answer()> work) {
+  const bool taken = booth_.disk().post([respond, work = std::move(work)] {
+    try {
+      respond(work());
+    } catch (const std::exception& fault) {
+      respond(Error{ErrorCode::internal, "the booth's program has a fault: " + std::string(fault.what())});
+    }
+  });
+  if (!taken) respond(Error{ErrorCode::busy, "too many requests wait for the disk; try again in a moment"});
+}
+
+std::optional<Reply> Dispatcher::dispatch(Method method, const Json& params, const Responder& respond) {
+  const auto no_params = [&](auto&& answer) -> Answer {
+    if (const auto request = parse_no_params(params); !request) return request.error();
+    return answer();
+  };
+  switch (method) {
+    case Method::system_describe: respond(no_params([&] { return describe(); })); break;
+    case Method::system_status: respond(no_params([&] { return status(); })); break;
+    case Method::system_metrics: respond(no_params([&] { return metrics(); })); break;
+    case Method::system_shutdown: respond(no_params([&] { return shut_down_(), Answer(Reply{}); })); break;
+    case Method::camera_discover: respond(no_params([] { return unsupported("looking for cameras"); })); break;
+    case Method::preview_start: respond(unsupported_after(parse_preview_start(params), "the preview")); break;
+    case Method::preview_stop: respond(unsupported_after(parse_preview_stop(params), "the preview")); break;
+    case Method::background_learn:
+      respond(unsupported_after(parse_background_learn(params), "learning the background"));
+      break;
+    case Method::calibration_capture:
+    case Method::calibration_solve:
+    case Method::calibration_apply:
+    case Method::calibration_discard: respond(no_params([] { return unsupported("the calibration"); })); break;
+    case Method::capture_start: respond(start_capture(params)); break;
+    case Method::capture_cancel:
+      if (const auto request = parse_id(params, "capture"); !refused(request, respond)) {
+        const auto cancelled = booth_.cancel_capture(request->id);
+        respond(cancelled ? Answer(Reply{}) : cancelled.error());
+      }
+      break;
+    case Method::job_list: respond(list_jobs(params)); break;
+    case Method::avatar_list: respond(list_avatars(params)); break;
+    case Method::avatar_get: get_avatar(params, respond); break;
+    case Method::avatar_fetch: fetch_avatar(params, respond); break;
+    case Method::job_retry:
+    case Method::job_cancel: return change_job(method, params, respond);
+    case Method::capture_delete:
+    case Method::avatar_delete: return remove(method, params, respond);
+  }
+  return std::nullopt;
+}
+
+Answer Dispatcher::describe() const {
+  Json names = Json::array();
+  for (const MethodEntry& entry : methods) names.push_back(entry.name);
+  return Reply{{{"name", booth_.name()},
+                {"version", BOOTH_VERSION},
+                {"api", api_version},
+                {"methods", names},
+                {"topics", topics()},
+                {"stages", job_stages()}}};
+}
+
+Answer Dispatcher::status() const {
+  const BoothStatus status = booth_.status();
+  Json cameras = Json::array();
+  for (const CameraStatus& camera : status.cameras) cameras.push_back(to_json(camera));
+  return Reply{
+      {{"state", to_string(status.state)},
+       {"state_since", iso8601(status.state_since, true)},
+       {"boot", status.boot},
+       {"sequence", status.sequence},
+       {"ready", status.not_ready.empty()},
+       {"not_ready", api::to_json(status.not_ready)},
+       {"capture", status.capture ? Json(*status.capture) : Json(nullptr)},
+       {"tasks", Json::array()},
+       {"cameras", cameras},
+       {"projector", to_json(status.projector, "id")},
+       {"trigger", to_json(status.trigger, "driver")},
+       {"calibration",
+        {{"loaded", status.calibration.loaded},
+         {"rms_px", status.calibration.rms_px ? Json(*status.calibration.rms_px) : Json(nullptr)},
+         {"created", text_or_null(status.calibration.created)}}},
+       {"background", {{"learned", status.background.learned}, {"created", text_or_null(status.background.created)}}},
+       {"queue", to_json(status.queue)},
+       {"disk", {{"free_bytes", status.disk.free_bytes}, {"limit_bytes", status.disk.limit_bytes}}},
+       {"uptime_s", status.uptime_s}}};
+}
+
+Answer Dispatcher::metrics() const { return Reply{booth_.measurements()}; }
+
+Answer Dispatcher::start_capture(const Json& params) {
+  const auto request = parse_capture_start(params);
+  if (!request) return request.error();
+  const auto started = booth_.start_capture(*request);
+  if (!started) return started.error();
+  return Reply{{{"capture", *started}}};
+}
+
+Answer Dispatcher::list_jobs(const Json& params) {
+  const auto request = parse_job_list(params);
+  if (!request) return request.error();
+  if (!request->job) return Reply{{{"jobs", to_json(booth_.jobs().list())}}};
+  const auto job = booth_.jobs().find(*request->job);
+  if (!job) return Error{ErrorCode::not_found, "there is no job " + *request->job};
+  return Reply{{{"jobs", to_json(std::vector<Job>{*job})}}};
+}
+
+std::optional<Reply> Dispatcher::change_job(Method method, const Json& params, const Responder& respond) {
+  const auto request = parse_id(params, "job");
+  if (refused(request, respond)) return std::nullopt;
+  JobQueue& jobs = booth_.jobs();
+  const auto changed = method == Method::job_retry ? jobs.retry(request->id) : jobs.cancel(request->id);
+  if (refused(changed, respond)) return std::nullopt;
+  on_disk(respond, [&jobs, id = request->id]() -> Answer {
+    if (const auto written = jobs.persist(id); !written) return written.error();
+    return Reply{};
+  });
+  return Reply{};
+}
+
+std::optional<Reply> Dispatcher::remove(Method method, const Json& params, const Responder& respond) {
+  const bool avatar = method == Method::avatar_delete;
+  const auto request = parse_id(params, avatar ? "avatar" : "capture");
+  if (refused(request, respond)) return std::nullopt;
+  const auto done = [respond](const Result<void>& deleted) {
+    respond(deleted ? Answer(Reply{}) : Answer(deleted.error()));
+  };
+  const auto begun = avatar ? booth_.delete_avatar(request->id, done) : booth_.delete_capture(request->id, done);
+  if (refused(begun, respond)) return std::nullopt;
+  return Reply{};
+}
+
+Answer Dispatcher::list_avatars(const Json& params) {
+  const auto request = parse_avatar_list(params);
+  if (!request) return request.error();
+  const auto found = booth_.avatars().list(request->limit, request->before);
+  if (!found) return found.error();
+  Json list = Json::array();
+  for (const AvatarSummary& avatar : *found) {
+    const std::string& capture = avatar.capture.empty() ? avatar.id : avatar.capture;
+    list.push_back({{"id", avatar.id},
+                    {"created", text_or_null(avatar.created)},
+                    {"label", text_or_null(avatar.label)},
+                    {"capture", text_or_null(avatar.capture)},
+                    {"job", booth_.jobs().find(capture) ? Json(capture) : Json(nullptr)},
+                    {"files", avatar.files},
+                    {"triangles", avatar.triangles ? Json(*avatar.triangles) : Json(nullptr)},
+                    {"warnings", avatar.warnings}});
+  }
+  return Reply{{{"avatars", list}}};
+}
+
+void Dispatcher::get_avatar(const Json& params, const Responder& respond) {
+  const auto request = parse_id(params, "avatar");
+  if (refused(request, respond)) return;
+  on_disk(respond, [&avatars = booth_.avatars(), id = request->id]() -> Answer {
+    const auto text = avatars.metadata(id);
+    if (!text) return text.error();
+    return Reply{Json::parse(*text)};
+  });
+}
+
+void Dispatcher::fetch_avatar(const Json& params, const Responder& respond) {
+  const auto request = parse_avatar_fetch(params);
+  if (refused(request, respond)) return;
+  on_disk(respond, [&avatars = booth_.avatars(), fetch = *request]() -> Answer {
+    auto piece = avatars.fetch(fetch.avatar, fetch.file, fetch.offset, fetch.length);
+    if (!piece) return piece.error();
+    return Reply{{{"size", piece->size}, {"sha256", piece->sha256}}, std::move(piece->bytes)};
+  });
+}
+
+}  // namespace booth::api

@@ -1,0 +1,62 @@
+#pragma once
+
+#include <cstdint>
+#include <nlohmann/json_fwd.hpp>
+#include <optional>
+#include <string>
+
+#include "daemon/capture_session.h"
+#include "pipeline/types/result.h"
+
+namespace booth::api {
+
+/// The largest piece of a file that avatar.fetch gives.
+constexpr uint64_t most_fetch_bytes = 8 * 1024 * 1024;
+
+struct NoParams {};
+struct PreviewStart {
+  std::string camera;
+  int fps = 10;
+  int max_width = 640;
+};
+struct PreviewStop {
+  std::string camera;
+};
+struct BackgroundLearn {
+  int frames = 10;
+};
+/// Of the methods that take one id: of a capture, a job or an avatar.
+struct IdParams {
+  std::string id;
+};
+struct JobList {
+  std::optional<std::string> job;
+};
+struct AvatarList {
+  size_t limit = 50;
+  std::string before;  ///< empty: from the newest
+};
+struct AvatarFetch {
+  std::string avatar, file;
+  uint64_t offset = 0;
+  uint64_t length = most_fetch_bytes;
+};
+
+// From a JSON object, without `key`, to a request. @error invalid_argument  the member, its value and what would do;
+// a member that is missing or that nobody asked for
+Result<NoParams> parse_no_params(const nlohmann::json& params);
+Result<PreviewStart> parse_preview_start(const nlohmann::json& params);
+Result<PreviewStop> parse_preview_stop(const nlohmann::json& params);
+Result<BackgroundLearn> parse_background_learn(const nlohmann::json& params);
+Result<CaptureRequest> parse_capture_start(const nlohmann::json& params);
+/// @param member  "capture", "job" or "avatar"
+Result<IdParams> parse_id(const nlohmann::json& params, const char* member);
+Result<JobList> parse_job_list(const nlohmann::json& params);
+Result<AvatarList> parse_avatar_list(const nlohmann::json& params);
+Result<AvatarFetch> parse_avatar_fetch(const nlohmann::json& params);
+
+/// The `key` of a request that changes something, taken out of `params`; nothing when it has none.
+/// @error invalid_argument  not a text of 1 … 64 characters
+Result<std::optional<std::string>> take_key(nlohmann::json& params);
+
+}  // namespace booth::api

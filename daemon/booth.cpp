@@ -1,0 +1,407 @@
+#include "daemon/booth.h"
+
+#include <fcntl.h>
+#include <pthread.h>
+#include <spdlog/spdlog.h>
+#include <sys/file.h>
+#include <sys/stat.h>
+#include <sys/statvfs.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <exception>
+#include <fstream>
+#include <set>
+#include <system_error>
+#include <utility>
+
+#include "daemon/identifier.h"
+#include "pipeline/types/rig.h"
+#include "replay/durable_folder.h"
+
+namespace booth {
+namespace {
+
+namespace fs = std::filesystem;
+using SteadyClock = std::chrono::steady_clock;
+
+constexpr uint64_t mebibyte = 1024 * 1024;
+constexpr size_t most_disk_tasks = 256;
+constexpr std::chrono::milliseconds house_pause{250};
+constexpr std::chrono::milliseconds heartbeat_pause{1000};
+constexpr std::chrono::milliseconds disk_pause{2000};        ///< between two looks at the space
+constexpr std::chrono::milliseconds drain_patience{10'000};  ///< for a capture under way
+
+ErrorCode code_of(const std::string& kind) {
+  for (const ErrorCode code : {ErrorCode::busy, ErrorCode::not_calibrated, ErrorCode::no_background,
+                               ErrorCode::disk_full, ErrorCode::not_ready})
+    if (kind == to_string(code)) return code;
+  return ErrorCode::device_lost;
+}
+
+std::string in_mebibytes(uint64_t bytes) { return std::to_string(bytes / mebibyte) + " MiB"; }
+
+/// Bytes of all files below a folder; a file with several names counts once.
+uint64_t size_of_tree(const fs::path& folder) {
+  std::set<ino_t> seen;
+  uint64_t bytes = 0;
+  std::error_code code;
+  for (fs::recursive_directory_iterator entry(folder, code), end; !code && entry != end; entry.increment(code)) {
+    struct stat status {};
+    if (::lstat(entry->path().c_str(), &status) != 0 || !S_ISREG(status.st_mode)) continue;
+    if (status.st_nlink == 1 || seen.insert(status.st_ino).second)
+      bytes += static_cast<uint64_t>(status.st_blocks) * 512;
+  }
+  return bytes;
+}
+
+/// Of this process; 0 where the system does not say.
+double resident_bytes() {
+  std::ifstream file("/proc/self/statm");
+  double size = 0, resident = 0;
+  file >> size >> resident;
+  return resident * static_cast<double>(::sysconf(_SC_PAGESIZE));
+}
+
+}  // namespace
+
+Booth::Booth(const BoothOptions& options, const Clock& clock)
+    : options_(options),
+      clock_(clock),
+      disk_executor_("disk", most_disk_tasks),
+      state_since_(std::chrono::system_clock::now()) {}
+
+Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<Devices> devices, const Clock& clock) {
+  std::unique_ptr<Booth> booth(new Booth(options, clock));
+  if (const auto locked = booth->lock_state(); !locked) return locked.error();
+  if (const auto opened = booth->open_stores(); !opened) return opened.error();
+  booth->measure_disk();
+  if (devices) {
+    booth->open_capture(*devices);
+  } else {
+    booth->device_fault_ = devices.error().message;
+    spdlog::error("no devices: {}", booth->device_fault_);
+  }
+  booth->adopt_orphans();
+
+  const BoothConfig& config = options.config;
+  booth->runner_ = std::make_unique<JobRunner>(JobRunnerOptions{.command = options.reconstruct_command,
+                                                                .config_file = options.config_file,
+                                                                .recordings = config.booth.recordings(),
+                                                                .workers = config.jobs.workers,
+                                                                .threads = config.jobs.threads,
+                                                                .timeout = std::chrono::seconds(config.jobs.timeout_s),
+                                                                .retries = config.jobs.retries},
+                                               *booth->jobs_, *booth->avatars_, booth->events_, booth->metrics_);
+  booth->eraser_ = std::make_unique<Eraser>(config.booth.state_directory, *booth->jobs_, *booth->avatars_,
+                                            booth->session_.get(), booth->events_);
+  booth->set_state(booth->device_fault_.empty() ? BoothState::idle : BoothState::fault);
+  booth->housekeeper_ = std::jthread([self = booth.get()](const std::stop_token& stop) { self->keep_house(stop); });
+  pthread_setname_np(booth->housekeeper_.native_handle(), "house");
+  return booth;
+}
+
+Booth::~Booth() {
+  housekeeper_.request_stop();
+  if (housekeeper_.joinable()) housekeeper_.join();
+  eraser_.reset();
+  runner_.reset();
+  session_.reset();
+  cameras_.reset();
+  if (state_lock_ >= 0) ::close(state_lock_);
+}
+
+Result<void> Booth::lock_state() {
+  const fs::path& folder = options_.config.booth.state_directory;
+  std::error_code code;
+  fs::create_directories(folder, code);
+  if (code) return Error{ErrorCode::io, folder.string() + ": cannot be made: " + code.message()};
+  const fs::path file = folder / "lock";
+  state_lock_ = ::open(file.c_str(), O_CREAT | O_RDWR | O_CLOEXEC, 0600);
+  if (state_lock_ < 0)
+    return Error{ErrorCode::io, file.string() + ": cannot be opened: " + std::generic_category().message(errno)};
+  if (::flock(state_lock_, LOCK_EX | LOCK_NB) != 0)
+    return Error{ErrorCode::busy, folder.string() + ": another booth works in this state directory"};
+  return {};
+}
+
+Result<void> Booth::open_stores() {
+  const IdentityConfig& booth = options_.config.booth;
+  if (const auto finished = Eraser::finish_interrupted(booth.state_directory); !finished) return finished;
+  std::error_code code;
+  fs::create_directories(booth.recordings(), code);
+  if (code) return Error{ErrorCode::io, booth.recordings().string() + ": cannot be made: " + code.message()};
+  if (const auto removed = remove_partial_folders(booth.recordings()); !removed) return removed.error();
+  auto jobs = JobQueue::open(booth.jobs(), events_);
+  if (!jobs) return jobs.error();
+  jobs_ = std::move(*jobs);
+  auto avatars = AvatarStore::open(booth.avatars());
+  if (!avatars) return avatars.error();
+  avatars_ = std::move(*avatars);
+  auto backgrounds = BackgroundStore::open(booth.backgrounds());
+  if (!backgrounds) return backgrounds.error();
+  backgrounds_ = std::move(*backgrounds);
+  return {};
+}
+
+void Booth::open_capture(const Devices& devices) {
+  if (!devices.rig) return;
+  calibration_.loaded = true;
+  calibration_.created = devices.rig_created;
+  for (const RigCamera& camera : devices.rig->cameras)
+    if (camera.rms_px) calibration_.rms_px = std::max(calibration_.rms_px.value_or(0), *camera.rms_px);
+
+  if (devices.replayed) {
+    const auto now = std::chrono::system_clock::now();
+    if (const auto adopted = backgrounds_->adopt(*devices.replayed, make_capture_id(now), devices.replayed->created);
+        !adopted)
+      spdlog::error("the replayed recording gives no background: {}", adopted.error().message);
+  }
+
+  std::vector<CameraInfo> cameras;
+  for (const RigCamera& camera : devices.rig->cameras)
+    cameras.push_back(
+        {camera.id, options_.config.drivers.camera, camera.role, camera.intrinsics.width, camera.intrinsics.height});
+  cameras_ = std::make_unique<CameraSupervisor>(cameras, devices.source, clock_, [this](const CameraStatus& camera) {
+    events_.publish(CameraChanged{camera.id, camera.state, camera.message});
+  });
+  session_ = std::make_unique<CaptureSession>(CaptureParts{.config = options_.config.capture,
+                                                           .recordings = options_.config.booth.recordings(),
+                                                           .source = devices.source,
+                                                           .rig = *devices.rig,
+                                                           .cameras = *cameras_,
+                                                           .backgrounds = *backgrounds_,
+                                                           .jobs = *jobs_,
+                                                           .events = events_,
+                                                           .metrics = metrics_,
+                                                           .clock = clock_,
+                                                           .set_state = [this](BoothState state) { set_state(state); },
+                                                           .check_disk = [this] { return check_disk(); }});
+}
+
+/// The daemon may have died after a capture was on the disk and before its job was, or between the two deletions of an
+/// earlier program version: recordings without a job get one, jobs without a recording go.
+void Booth::adopt_orphans() {
+  const IdentityConfig& booth = options_.config.booth;
+  std::error_code code;
+  for (fs::directory_iterator entry(booth.recordings(), code), end; !code && entry != end; entry.increment(code)) {
+    const std::string id = entry->path().filename().string();
+    if (!is_safe_id(id) || jobs_->find(id) || avatars_->find(id)) continue;
+    const auto recording = read_recording(entry->path());
+    if (!recording) {
+      spdlog::warn("{}: not a recording: {}", entry->path().string(), recording.error().message);
+      continue;
+    }
+    spdlog::info("capture {}: had no job, it gets one", id);
+    jobs_->add(
+        {.id = id, .face = face_mode_from(recording->face) ? recording->face : "auto", .label = recording->label});
+    if (const auto written = jobs_->persist(id); !written) spdlog::error("{}", written.error().message);
+  }
+  for (const Job& job : jobs_->list()) {
+    if (fs::exists(booth.recordings() / job.id, code) || avatars_->find(job.id)) continue;
+    spdlog::info("job {}: its recording is gone, and so it goes", job.id);
+    jobs_->forget(job.id);
+    if (const auto written = jobs_->persist(job.id); !written) spdlog::error("{}", written.error().message);
+  }
+}
+
+void Booth::set_state(BoothState state) {
+  {
+    const std::lock_guard lock(state_mutex_);
+    // A booth that stops does nothing else any more; one without devices cannot.
+    if (state_ == BoothState::stopping || state_ == state) return;
+    state_ = state;
+    state_since_ = std::chrono::system_clock::now();
+  }
+  refresh();
+}
+
+/// Tells listeners when the state, or why no capture can start, is no longer what they were told last.
+void Booth::refresh() {
+  const std::lock_guard lock(state_mutex_);
+  std::vector<Reason> reasons = find_reasons(state_);
+  if (announced_ && announced_state_ == state_ && *announced_ == reasons) return;
+  events_.publish(StateChanged{state_, announced_state_, reasons.empty(), reasons});
+  announced_state_ = state_;
+  announced_ = std::move(reasons);
+}
+
+std::vector<Reason> Booth::find_reasons(BoothState state) const {
+  std::vector<Reason> reasons;
+  if (state == BoothState::starting) reasons.push_back({"not_ready", "the booth is starting"});
+  if (state == BoothState::stopping) reasons.push_back({"not_ready", "the booth is stopping"});
+  if (state == BoothState::fault) reasons.push_back({"not_ready", "the booth has no devices: " + device_fault_});
+  if (session_ != nullptr) {
+    if (const auto capture = session_->current()) reasons.push_back({"busy", "capture " + *capture + " is under way"});
+    if (const DeviceStatus trigger = session_->trigger(); trigger.state == DeviceState::offline)
+      reasons.push_back({"camera_unavailable", "the trigger is offline: " + trigger.message});
+  }
+  if (!calibration_.loaded) reasons.push_back({"not_calibrated", "the booth is not calibrated"});
+  if (cameras_ != nullptr) {
+    int online = 0;
+    std::string offline;
+    for (const CameraStatus& camera : cameras_->status()) {
+      if (camera.role != CameraRole::body) continue;
+      if (camera.state != DeviceState::offline)
+        ++online;
+      else
+        offline += (offline.empty() ? "" : "; ") + camera.id + ": " + camera.message;
+    }
+    if (const int needed = options_.config.capture.min_cameras; online < needed)
+      reasons.push_back({"camera_unavailable", std::to_string(online) + " body cameras are online, at least " +
+                                                   std::to_string(needed) +
+                                                   " are needed. Offline: " + (offline.empty() ? "none" : offline)});
+  }
+  if (backgrounds_->current() == nullptr)
+    reasons.push_back({"no_background", "the booth has not learned its background yet"});
+  if (const auto disk = check_disk(); !disk) reasons.push_back({"disk_full", disk.error().message});
+  return reasons;
+}
+
+Result<void> Booth::check_disk() const {
+  const DiskConfig& disk = options_.config.disk;
+  const uint64_t reserve = static_cast<uint64_t>(disk.reserve_mib) * mebibyte;
+  const uint64_t limit = static_cast<uint64_t>(disk.limit_mib) * mebibyte;
+  if (free_bytes_ < reserve)
+    return Error{ErrorCode::disk_full, in_mebibytes(free_bytes_) + " are free on the disk, at least " +
+                                           in_mebibytes(reserve) + " must be: delete avatars or make room"};
+  if (limit > 0 && used_bytes_ > limit)
+    return Error{ErrorCode::disk_full, "recordings and avatars take " + in_mebibytes(used_bytes_) + " of the " +
+                                           in_mebibytes(limit) + " allowed: delete avatars"};
+  return {};
+}
+
+void Booth::measure_disk() {
+  const fs::path& folder = options_.config.booth.state_directory;
+  struct statvfs space {};
+  if (::statvfs(folder.c_str(), &space) == 0) free_bytes_ = static_cast<uint64_t>(space.f_bavail) * space.f_frsize;
+  if (options_.config.disk.limit_mib > 0) used_bytes_ = size_of_tree(folder);
+}
+
+void Booth::keep_house(const std::stop_token& stop) {
+  auto next_heartbeat = SteadyClock::now(), next_disk = next_heartbeat;
+  bool disk_was_full = false;
+  while (!stop.stop_requested()) {
+    house_pulse_.beat();
+    try {
+      const auto now = SteadyClock::now();
+      if (now >= next_disk) {
+        measure_disk();
+        next_disk = SteadyClock::now() + disk_pause;
+        const auto disk = check_disk();
+        if (!disk && !disk_was_full) events_.publish(Alert{Severity::error, "disk_full", disk.error().message});
+        disk_was_full = !disk;
+      }
+      refresh();
+      if (now >= next_heartbeat) {
+        const std::lock_guard lock(state_mutex_);
+        events_.publish(Heartbeat{state_, announced_ && announced_->empty()});
+        next_heartbeat = std::max(next_heartbeat + heartbeat_pause, now);
+      }
+    } catch (const std::exception& fault) {
+      spdlog::error("housekeeping: {}", fault.what());
+    }
+    std::this_thread::sleep_for(house_pause);
+  }
+}
+
+BoothStatus Booth::status() const {
+  BoothStatus status;
+  // Before everything else: what events up to it say must be in what follows.
+  status.sequence = events_.sequence();
+  status.boot = events_.boot();
+  {
+    const std::lock_guard lock(state_mutex_);
+    status.state = state_;
+    status.state_since = state_since_;
+    status.not_ready = find_reasons(state_);
+  }
+  if (session_ != nullptr) {
+    status.capture = session_->current();
+    status.trigger = session_->trigger();
+    status.trigger->name = options_.config.drivers.camera;
+    status.projector = session_->projector();
+  }
+  if (cameras_ != nullptr) status.cameras = cameras_->status();
+  status.calibration = calibration_;
+  if (const auto background = backgrounds_->current()) status.background = {true, background->created};
+  for (Job& job : jobs_->list())
+    if (job.state != JobState::done) status.queue.push_back(std::move(job));
+  status.disk = {free_bytes_, static_cast<uint64_t>(options_.config.disk.reserve_mib) * mebibyte};
+  status.uptime_s = std::chrono::duration<double>(SteadyClock::now() - started_).count();
+  return status;
+}
+
+std::map<std::string, double> Booth::measurements() const {
+  std::map<std::string, double> values = metrics_.snapshot();
+  values["uptime_s"] = std::chrono::duration<double>(SteadyClock::now() - started_).count();
+  values["resident_bytes"] = resident_bytes();
+  values["events"] = static_cast<double>(events_.sequence());
+  values["events_lost"] = static_cast<double>(events_.lost());
+  values["disk_free_bytes"] = static_cast<double>(free_bytes_.load());
+  for (const JobState state :
+       {JobState::queued, JobState::running, JobState::failed, JobState::done, JobState::cancelled})
+    values["jobs_now_" + std::string(to_string(state))] = 0;
+  for (const Job& job : jobs_->list()) values["jobs_now_" + std::string(to_string(job.state))] += 1;
+  if (cameras_ != nullptr)
+    for (const CameraStatus& camera : cameras_->status()) {
+      values["camera_" + camera.id + "_frames"] = static_cast<double>(camera.frames);
+      values["camera_" + camera.id + "_dropped"] = static_cast<double>(camera.dropped);
+    }
+  return values;
+}
+
+Result<std::string> Booth::start_capture(const CaptureRequest& request) {
+  if (session_ != nullptr && session_->current() == std::nullopt && request.face == FaceMode::active &&
+      !session_->projector())
+    return Error{ErrorCode::unsupported, "this booth has no projector: choose the face mode passive or none"};
+  BoothState state{};
+  {
+    const std::lock_guard lock(state_mutex_);
+    state = state_;
+  }
+  if (const auto reasons = find_reasons(state); !reasons.empty())
+    return Error{code_of(reasons.front().kind), reasons.front().message};
+  if (request.face == FaceMode::active && session_->projector()->state == DeviceState::offline)
+    return Error{ErrorCode::device_lost, "the projector is offline: " + session_->projector()->message};
+  return session_->start(request);
+}
+
+Result<void> Booth::cancel_capture(const std::string& capture) {
+  if (session_ != nullptr) return session_->cancel(capture);
+  if (jobs_->find(capture)) return Error{ErrorCode::invalid_state, "capture " + capture + " is over"};
+  return Error{ErrorCode::not_found, "there is no capture " + capture};
+}
+
+Result<void> Booth::delete_capture(const std::string& capture, std::function<void(Result<void>)> done) {
+  std::set<std::string> ids{capture};
+  for (const std::string& avatar : avatars_->of_capture(capture)) ids.insert(avatar);
+  // Nothing can have a name that is not one.
+  if (!is_safe_id(capture)) return done({}), Result<void>{};
+  return eraser_->erase(ids, std::move(done));
+}
+
+Result<void> Booth::delete_avatar(const std::string& avatar, std::function<void(Result<void>)> done) {
+  if (!is_safe_id(avatar)) return done({}), Result<void>{};
+  std::set<std::string> ids{avatar};
+  if (const auto summary = avatars_->find(avatar); summary && !summary->capture.empty()) {
+    ids.insert(summary->capture);
+    for (const std::string& other : avatars_->of_capture(summary->capture)) ids.insert(other);
+  }
+  return eraser_->erase(ids, std::move(done));
+}
+
+void Booth::drain() {
+  set_state(BoothState::stopping);
+  if (session_ != nullptr) session_->drain(drain_patience);
+  runner_->stop();
+}
+
+Pulse::TimePoint Booth::last_pulse() const {
+  Pulse::TimePoint last = std::min(house_pulse_.last(), runner_->last_pulse());
+  if (session_ != nullptr) last = std::min(last, session_->last_pulse());
+  return last;
+}
+
+}  // namespace booth

@@ -1,0 +1,166 @@
+#pragma once
+
+#include <atomic>
+#include <chrono>
+#include <filesystem>
+#include <functional>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "config/booth_config.h"
+#include "daemon/avatar_store.h"
+#include "daemon/background_store.h"
+#include "daemon/camera_supervisor.h"
+#include "daemon/capture_session.h"
+#include "daemon/eraser.h"
+#include "daemon/event_bus.h"
+#include "daemon/job_queue.h"
+#include "daemon/job_runner.h"
+#include "daemon/metrics.h"
+#include "daemon/serial_executor.h"
+#include "drivers/clock.h"
+#include "drivers/device_source.h"
+#include "replay/recording.h"
+
+namespace booth {
+
+/// The devices that the configuration names, and the rig that they belong to.
+struct Devices {
+  std::shared_ptr<DeviceSource> source;
+  std::optional<Rig> rig;
+  std::string rig_created;            ///< ISO 8601, UTC; may be empty
+  std::optional<Recording> replayed;  ///< whose background is the booth's, where the devices are played back
+};
+
+/// @error as the driver's; unsupported  no driver of that name
+Result<Devices> open_devices(const BoothConfig& config, const Clock& clock);
+
+struct BoothOptions {
+  BoothConfig config;
+  std::filesystem::path config_file;          ///< handed to the reconstruction; may be empty
+  std::filesystem::path reconstruct_command;  ///< see JobRunnerOptions::command
+};
+
+struct CalibrationStatus {
+  bool loaded = false;
+  std::optional<double> rms_px;  ///< the worst camera's
+  std::string created;           ///< may be empty
+};
+struct BackgroundStatus {
+  bool learned = false;
+  std::string created;  ///< may be empty
+};
+struct DiskStatus {
+  uint64_t free_bytes = 0;
+  uint64_t limit_bytes = 0;  ///< with less free no capture starts
+};
+
+/// Everything at one instant.
+struct BoothStatus {
+  BoothState state = BoothState::starting;
+  std::chrono::system_clock::time_point state_since;
+  std::string boot;
+  uint64_t sequence = 0;  ///< what events up to it say is in here
+  std::vector<Reason> not_ready;
+  std::optional<std::string> capture;
+  std::vector<CameraStatus> cameras;
+  std::optional<DeviceStatus> projector, trigger;
+  CalibrationStatus calibration;
+  BackgroundStatus background;
+  std::vector<Job> queue;  ///< not done
+  DiskStatus disk;
+  double uptime_s = 0;
+};
+
+struct JobSummary {
+  Job job;
+  bool has_avatar = false;
+};
+
+/// The booth: its devices, its captures, its jobs and its avatars, put together. It knows nothing of how it is talked
+/// to. Any thread may call; calls that wait for the disk say so.
+class Booth {
+ public:
+  /// Reads the state directory, opens the devices and goes on with what was under way. Devices that cannot be opened
+  /// are no reason not to start: the status says so.
+  ///
+  /// @param devices  an error makes the state `fault`
+  /// @param clock    outlives the booth
+  /// @error io, disk_full  the state directory cannot be used; busy  another process uses it
+  static Result<std::unique_ptr<Booth>> open(const BoothOptions& options, Result<Devices> devices, const Clock& clock);
+  ~Booth();
+
+  EventBus& events() { return events_; }
+  Metrics& metrics() { return metrics_; }
+  /// Work that waits for the disk, for those who may not.
+  SerialExecutor& disk() { return disk_executor_; }
+  const std::string& name() const { return options_.config.booth.name; }
+  const std::filesystem::path& state_directory() const { return options_.config.booth.state_directory; }
+
+  BoothStatus status() const;
+  std::map<std::string, double> measurements() const;
+
+  /// @error busy, unsupported, not_ready, not_calibrated, no_background, disk_full, device_lost
+  Result<std::string> start_capture(const CaptureRequest& request);
+  Result<void> cancel_capture(const std::string& capture);
+  /// @param done  called when nothing is left, from another thread or at once
+  Result<void> delete_capture(const std::string& capture, std::function<void(Result<void>)> done);
+  /// Deletes its recording too.
+  Result<void> delete_avatar(const std::string& avatar, std::function<void(Result<void>)> done);
+
+  JobQueue& jobs() { return *jobs_; }
+  AvatarStore& avatars() { return *avatars_; }
+  const AvatarStore& avatars() const { return *avatars_; }
+
+  /// No new work; what is under way ends soon, and the processes of jobs at once. Waits for that, some seconds at most.
+  void drain();
+  /// When the least lively thread last gave a sign of life.
+  Pulse::TimePoint last_pulse() const;
+
+ private:
+  Booth(const BoothOptions& options, const Clock& clock);
+  Result<void> lock_state();
+  Result<void> open_stores();
+  void open_capture(const Devices& devices);
+  void adopt_orphans();
+  void set_state(BoothState state);
+  void refresh();
+  std::vector<Reason> find_reasons(BoothState state) const;
+  Result<void> check_disk() const;
+  void measure_disk();
+  void keep_house(const std::stop_token& stop);
+
+  const BoothOptions options_;
+  const Clock& clock_;
+  const std::chrono::steady_clock::time_point started_ = std::chrono::steady_clock::now();
+  EventBus events_;
+  Metrics metrics_;
+  int state_lock_ = -1;  ///< an open descriptor, locked while this booth uses the state directory
+  SerialExecutor disk_executor_;
+
+  std::unique_ptr<JobQueue> jobs_;
+  std::unique_ptr<AvatarStore> avatars_;
+  std::unique_ptr<BackgroundStore> backgrounds_;
+  CalibrationStatus calibration_;
+  std::string device_fault_;  ///< why there are no devices; empty when there are
+  std::unique_ptr<CameraSupervisor> cameras_;
+  std::unique_ptr<CaptureSession> session_;
+  std::unique_ptr<JobRunner> runner_;
+  std::unique_ptr<Eraser> eraser_;
+
+  std::atomic<uint64_t> free_bytes_{0}, used_bytes_{0};
+  mutable std::mutex state_mutex_;
+  BoothState state_ = BoothState::starting;            ///< guarded by state_mutex_
+  std::chrono::system_clock::time_point state_since_;  ///< guarded by state_mutex_
+  std::optional<std::vector<Reason>> announced_;       ///< guarded by state_mutex_; of the last state event
+  BoothState announced_state_ = BoothState::starting;  ///< guarded by state_mutex_
+  Pulse house_pulse_;
+  std::jthread housekeeper_;
+};
+
+}  // namespace booth

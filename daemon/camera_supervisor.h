@@ -1,0 +1,102 @@
+#pragma once
+
+#include <condition_variable>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "daemon/bounded_queue.h"
+#include "daemon/event.h"
+#include "drivers/camera.h"
+#include "drivers/clock.h"
+#include "drivers/device_source.h"
+
+namespace booth {
+
+struct CameraStatus {
+  std::string id, driver;
+  CameraRole role = CameraRole::body;
+  DeviceState state = DeviceState::offline;
+  std::string message;  ///< why it is not online
+  uint64_t frames = 0, dropped = 0;
+  std::optional<double> last_frame_age_s = {};
+};
+
+/// What an armed camera has to say: that it is armed, a frame, or what went wrong.
+struct CameraNews {
+  enum class Kind { armed, frame, fault };
+  Kind kind = Kind::armed;
+  std::string camera;
+  std::optional<Frame> frame;  ///< of Kind::frame
+  Error error;                 ///< of Kind::fault
+};
+using CameraInbox = BoundedQueue<CameraNews>;
+
+/// One camera and the thread that lives with it: opens it, opens it again after a loss, with growing patience, and
+/// waits for its frames. Any thread may call.
+class SupervisedCamera {
+ public:
+  /// @param changed  called from this camera's thread, or the caller's of note_missing, when its state changes
+  SupervisedCamera(CameraInfo info, std::shared_ptr<DeviceSource> source, const Clock& clock,
+                   std::function<void(const CameraStatus&)> changed);
+  ~SupervisedCamera();
+
+  const std::string& id() const { return info_.id; }
+  CameraStatus status() const;
+
+  /// Arms it, soon; the inbox hears whether that went well and then of each frame, until disarm().
+  void arm(const CaptureSettings& settings, int count, std::shared_ptr<CameraInbox> inbox);
+  void disarm() noexcept;
+  /// A frame that should have come did not: the camera is degraded until the next one comes.
+  void note_missing(const std::string& message);
+
+ private:
+  struct Order {
+    CaptureSettings settings;
+    int count = 0;
+    std::shared_ptr<CameraInbox> inbox;
+  };
+  void run(const std::stop_token& stop);
+  bool open();
+  void serve(const Order& order, uint64_t number, const std::stop_token& stop);
+  void lose(const Error& error);
+  void set_state(DeviceState state, const std::string& message);
+  bool is_current(uint64_t number) const;
+
+  const CameraInfo info_;
+  const std::shared_ptr<DeviceSource> source_;
+  const Clock& clock_;
+  const std::function<void(const CameraStatus&)> changed_;
+
+  mutable std::mutex mutex_;
+  std::condition_variable_any wake_;
+  std::unique_ptr<Camera> device_;       ///< replaced under mutex_ by the camera's thread alone, which reads it without
+  std::optional<Order> order_;           ///< guarded by mutex_
+  uint64_t order_number_ = 0;            ///< guarded by mutex_; changes when an order is given or withdrawn
+  CameraStatus status_;                  ///< guarded by mutex_
+  std::optional<Timestamp> last_frame_;  ///< guarded by mutex_
+  std::jthread thread_;
+};
+
+/// All cameras of the rig.
+class CameraSupervisor {
+ public:
+  CameraSupervisor(const std::vector<CameraInfo>& cameras, const std::shared_ptr<DeviceSource>& source,
+                   const Clock& clock, const std::function<void(const CameraStatus&)>& changed);
+
+  std::vector<CameraStatus> status() const;
+  /// The ids of the rig's cameras; with `role`, of those of that role.
+  std::vector<std::string> ids() const;
+  std::vector<std::string> ids(CameraRole role) const;
+  SupervisedCamera& camera(const std::string& id);
+
+ private:
+  std::vector<std::unique_ptr<SupervisedCamera>> cameras_;
+};
+
+}  // namespace booth

@@ -1,0 +1,61 @@
+#pragma once
+
+#include <atomic>
+#include <chrono>
+#include <filesystem>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "daemon/avatar_store.h"
+#include "daemon/event_bus.h"
+#include "daemon/job_queue.h"
+#include "daemon/metrics.h"
+#include "daemon/pulse.h"
+
+namespace booth {
+
+struct JobRunnerOptions {
+  std::filesystem::path command;      ///< the program that reconstructs: COMMAND RECORDING AVATAR --face MODE …
+  std::filesystem::path config_file;  ///< handed to it; may be empty
+  std::filesystem::path recordings;
+  int workers = 1;
+  int threads = 0;  ///< of one reconstruction; 0: as many as there are processors
+  std::chrono::milliseconds timeout{300'000};
+  int retries = 1;  ///< of a job whose process died
+};
+
+/// Takes jobs from the queue and runs each in a process of its own, so that no input can take the daemon down.
+///
+/// The process says on descriptor 3, one JSON object a line, how far it is: {"stage": "hull", "fraction": 0.42}, the
+/// fraction that of the whole job; and why it failed: {"error": {"kind": "no_subject", "message": "…"}}. It ends with
+/// status 0 after the avatar's folder has appeared by a rename.
+class JobRunner {
+ public:
+  JobRunner(JobRunnerOptions options, JobQueue& jobs, AvatarStore& avatars, EventBus& events, Metrics& metrics);
+  ~JobRunner();
+
+  /// Kills what runs; those jobs go back into the queue. Waits for that.
+  void stop();
+
+  /// The slowest worker's sign of life.
+  std::chrono::steady_clock::time_point last_pulse() const;
+
+ private:
+  struct Run;
+  void work(const std::stop_token& stop, Pulse& pulse);
+  void run(const JobQueue::Lease& lease, const std::stop_token& stop, Pulse& pulse);
+  void conclude(const JobQueue::Lease& lease, const Run& run);
+  void publish(const JobQueue::Lease& lease);
+  void persist(const std::string& job);
+
+  const JobRunnerOptions options_;
+  JobQueue& jobs_;
+  AvatarStore& avatars_;
+  EventBus& events_;
+  Metrics& metrics_;
+  std::vector<Pulse> pulses_;  ///< one a worker
+  std::vector<std::jthread> workers_;
+};
+
+}  // namespace booth
