@@ -107,7 +107,7 @@ void visit_reconstruct(Visitor& visitor, ReconstructionOptions& options) {
   visitor.integer("triangles", options.decimation.triangles, 500, 1'000'000);
   visitor.integer("atlas_size", options.atlas.size, 256, 8192);
   visitor.millimetres("voxel_mm", options.hull.voxel_m, 1, 50);
-  visitor.integer("min_views", options.hull.min_views, 2, 256);
+  visitor.integer("min_views", options.hull.min_views, 1, 256);
 }
 
 template <class Visitor>

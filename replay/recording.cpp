@@ -309,40 +309,51 @@ Result<Image> decode_frame(std::span<const uint8_t> bytes, const Intrinsics& exp
   return opaque;
 }
 
-Result<Rig> read_rig(const fs::path& file) {
-  const auto text = read_file(file, largest_json_bytes);
-  if (!text) return text.error();
-  auto rig = read_rig_text(file.filename().string(), *text);
+Result<Rig> parse_rig(const std::string& name, std::span<const uint8_t> rig_json) {
+  auto rig = read_rig_text(name, rig_json);
   if (!rig) return rig.error();
   return std::move(rig->rig);
 }
 
-Result<Recording> read_recording(const fs::path& folder) {
-  std::error_code code;
-  if (!fs::is_directory(folder, code)) return Error{ErrorCode::not_found, folder.string() + ": is not a folder"};
-  const std::string name = "recording.json";
-  const auto text = read_recording_file(folder, name, largest_json_bytes);
-  if (!text && text.error().code == ErrorCode::not_found)
-    return Error{ErrorCode::not_found, folder.string() + ": is not a recording: it holds no " + name};
+Result<Rig> read_rig(const fs::path& file) {
+  const auto text = read_file(file, largest_json_bytes);
   if (!text) return text.error();
-  auto document = JsonDocument::parse(name, *text);
+  return parse_rig(file.filename().string(), *text);
+}
+
+Result<Recording> parse_recording(std::span<const uint8_t> recording_json, const ReadFile& read) {
+  const std::string name = "recording.json";
+  auto document = JsonDocument::parse(name, recording_json);
   if (!document) return document.error();
   const JsonField root(*document);
 
   Recording recording;
-  recording.folder = folder;
   expect_format(root, "booth-recording");
   read_header(root, recording);
   const std::string rig_file = root.member("rig").relative_path();
   if (!document->ok()) return document->error();
 
-  const auto rig_text = read_recording_file(folder, rig_file, largest_json_bytes);
+  const auto rig_text = read(rig_file);
   if (!rig_text) return Error{ErrorCode::invalid_file, name + ": rig: " + rig_text.error().message};
   auto rig = read_rig_text(rig_file, *rig_text);
   if (!rig) return rig.error();
   recording.shots = read_shots(root.member("shots"), *rig);
   if (!document->ok()) return document->error();
   recording.rig = std::move(rig->rig);
+  return recording;
+}
+
+Result<Recording> read_recording(const fs::path& folder) {
+  std::error_code code;
+  if (!fs::is_directory(folder, code)) return Error{ErrorCode::not_found, folder.string() + ": is not a folder"};
+  const std::string name = "recording.json";
+  const auto read = [&](const std::string& file) { return read_recording_file(folder, file, largest_json_bytes); };
+  const auto text = read(name);
+  if (!text && text.error().code == ErrorCode::not_found)
+    return Error{ErrorCode::not_found, folder.string() + ": is not a recording: it holds no " + name};
+  if (!text) return text.error();
+  auto recording = parse_recording(*text, read);
+  if (recording) recording->folder = folder;
   return recording;
 }
 

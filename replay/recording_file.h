@@ -2,6 +2,7 @@
 
 #include <cstdint>
 #include <filesystem>
+#include <functional>
 #include <span>
 #include <string>
 #include <vector>
@@ -29,6 +30,15 @@ Result<std::filesystem::path> resolve_recording_file(const std::filesystem::path
 /// @error as resolve_recording_file; @error invalid_file  larger than `most_bytes`, or not a regular file
 Result<std::vector<uint8_t>> read_recording_file(const std::filesystem::path& folder, const std::string& file,
                                                  size_t most_bytes);
+
+/// rig.json's text; `name` is how messages call the file. @error as read_recording
+Result<Rig> parse_rig(const std::string& name, std::span<const uint8_t> rig_json);
+
+/// The bytes of a file that a recording names.
+using ReadFile = std::function<Result<std::vector<uint8_t>>(const std::string& file)>;
+
+/// recording.json's text, with the rig that it names read by `read`; the folder is left empty. @error as read_recording
+Result<Recording> parse_recording(std::span<const uint8_t> recording_json, const ReadFile& read);
 
 /// Decodes a camera's PNG or JPEG to grey or RGB; transparency is dropped. An image that is not the size of its
 /// camera is refused before its pixels are decoded. @error invalid_file
