@@ -151,6 +151,7 @@ void write_material(Text& out, const ColladaOptions& options) {
       << "        <technique sid=\"common\"><lambert>\n"
       << "          <emission><color>0 0 0 1</color></emission>\n"
       << "          <diffuse><texture texture=\"avatar-sampler\" texcoord=\"UVMap\"/></diffuse>\n"
+      << "          <index_of_refraction><float>1.45</float></index_of_refraction>\n"
       << "        </lambert></technique>\n      </profile_COMMON>\n    </effect>\n  </library_effects>\n";
   out << "  <library_materials>\n    <material id=\"" << material_id << "\" name=\"" << material_id
       << "\"><instance_effect url=\"#" << effect_id << "\"/></material>\n  </library_materials>\n";

@@ -324,13 +324,16 @@ def run(command, **options):
 
 
 def assimp_reads_both(avatar):
+    # Assimp leaves out joints that move no vertex, such as the crown's.
+    moving = {joint for joints in avatar.skin().joint_index for joint in joints} if avatar.rigged else ()
+    expected = {len(moving), avatar.metadata["joints"]}
     for name in ("avatar.dae", "avatar.glb"):
         info = run(["assimp", "info", avatar.path(name)])
         require(info.returncode == 0, "%s: %s" % (name, info.stdout[-300:]))
         numbers = {key: int(value) for key, value in re.findall(r"^(\w+):\s+(\d+)$", info.stdout, re.MULTILINE)}
         require(numbers.get("Meshes") == 1, "%s: %s meshes" % (name, numbers.get("Meshes")))
         require(numbers.get("Faces") == avatar.metadata["triangles"], "%s: %s faces" % (name, numbers.get("Faces")))
-        require(numbers.get("Bones") == avatar.metadata["joints"], "%s: %s bones" % (name, numbers.get("Bones")))
+        require(numbers.get("Bones") in expected, "%s: %s bones" % (name, numbers.get("Bones")))
 
 
 def assimp_converts(avatar):
@@ -343,9 +346,11 @@ def assimp_converts(avatar):
 
 
 def blender_poses_it(avatar):
-    result = run(["blender", "-b", "--factory-startup", "--python-exit-code", "1", "--python",
-                  os.path.join(HERE, "blender_check.py"), "--", os.path.abspath(avatar.path("avatar.dae"))])
-    require(result.returncode == 0, result.stdout[-1500:])
+    with tempfile.TemporaryDirectory() as scratch:  # Blender would leave its own behind
+        result = run(["blender", "-b", "--factory-startup", "--python-exit-code", "1", "--python",
+                      os.path.join(HERE, "blender_check.py"), "--", os.path.abspath(avatar.path("avatar.dae"))],
+                     env={**os.environ, "TMPDIR": scratch})
+    require(result.returncode == 0, result.stdout[-500:])
 
 
 CHECKS = [files_are_as_listed, collada_is_schema_valid, collada_opens_without_errors, mesh_is_complete,
