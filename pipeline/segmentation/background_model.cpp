@@ -13,26 +13,35 @@ constexpr double target_cells = 400000;
 /// Beyond this many pixels a cell would swallow fingers, however large the sensor is.
 constexpr int max_step = 4;
 
-/// Sums over the pixels of each cell of one cell row, channel by channel interleaved; pixels beyond the image
-/// repeat its last ones.
-void sum_cell_row(const Image& image, const CellGrid& grid, int cell_y, std::vector<uint32_t>& column_sums,
-                  std::vector<uint32_t>& cell_sums) {
-  const size_t row_samples = static_cast<size_t>(image.width) * static_cast<size_t>(image.channels);
-  column_sums.assign(row_samples, 0);
-  for (int dy = 0; dy < grid.step; ++dy) {
-    const uint8_t* row = image.pixel(0, std::min(cell_y * grid.step + dy, image.height - 1));
-    for (size_t i = 0; i < row_samples; ++i) column_sums[i] += row[i];
-  }
-  const int channels = image.channels;
-  for (int x = 0; x < grid.width; ++x) {
+template <int channels, int step>
+void add_columns(const std::vector<uint16_t>& columns, int cells, std::vector<uint32_t>& cell_sums) {
+  for (int x = 0; x < cells; ++x) {
     for (int c = 0; c < channels; ++c) {
       uint32_t sum = 0;
-      for (int dx = 0; dx < grid.step; ++dx) {
-        sum += column_sums[static_cast<size_t>(std::min(x * grid.step + dx, image.width - 1) * channels + c)];
-      }
+      for (int dx = 0; dx < step; ++dx) sum += columns[static_cast<size_t>((x * step + dx) * channels + c)];
       cell_sums[static_cast<size_t>(x * channels + c)] = sum;
     }
   }
+}
+
+/// Sums over the pixels of each cell of one cell row, channel by channel interleaved; pixels beyond the image
+/// repeat its last ones.
+void sum_cell_row(const Image& image, const CellGrid& grid, int cell_y, std::vector<uint16_t>& columns,
+                  std::vector<uint32_t>& cell_sums) {
+  const auto channels = static_cast<size_t>(image.channels);
+  const size_t row_samples = static_cast<size_t>(image.width) * channels;
+  const size_t padded_samples = static_cast<size_t>(grid.width * grid.step) * channels;
+  columns.assign(padded_samples, 0);
+  for (int dy = 0; dy < grid.step; ++dy) {
+    const uint8_t* row = image.pixel(0, std::min(cell_y * grid.step + dy, image.height - 1));
+    for (size_t i = 0; i < row_samples; ++i) columns[i] = static_cast<uint16_t>(columns[i] + row[i]);
+  }
+  for (size_t i = row_samples; i < padded_samples; ++i) columns[i] = columns[i - channels];
+  static_assert(max_step == 4);
+  using Add = void (*)(const std::vector<uint16_t>&, int, std::vector<uint32_t>&);
+  constexpr std::array<Add, max_step> grey{add_columns<1, 1>, add_columns<1, 2>, add_columns<1, 3>, add_columns<1, 4>};
+  constexpr std::array<Add, max_step> color{add_columns<3, 1>, add_columns<3, 2>, add_columns<3, 3>, add_columns<3, 4>};
+  (channels == 1 ? grey : color)[static_cast<size_t>(grid.step - 1)](columns, grid.width, cell_sums);
 }
 
 CellPlanes make_planes(int channels, size_t count, float fill = 0) {
@@ -63,6 +72,8 @@ constexpr float expected_drift = 0.15F;
 /// lighter by shadow and bounced light, and in chromaticity.
 constexpr std::array<float, 3> drift_slack{0.08F, 0.08F, 0.06F};  // one refinement after the other
 constexpr float drift_chroma_slack = 0.025F;
+/// Every so many cells, along both axes, are asked about the drift.
+constexpr int drift_stride = 2;
 /// Cells along the edge of a block that gets one estimate of the drift.
 constexpr int drift_block = 16;
 /// Over how many blocks the drift is smoothed: shadows are to stay visible as such.
@@ -103,20 +114,28 @@ float most_common(const std::vector<float>& values) {
 
 /// The drift that most of the image shares. Brightness may vary over the image and then peaks where it likes, so that
 /// the channels need not peak in the same place; white balance hardly varies and is sought in their differences.
-std::array<float, 3> common_drift(const CellPlanes& difference) {
-  const std::vector<float>& red = difference.values[0];
-  if (difference.channels == 1) return {most_common(red), 0, 0};
-  const std::vector<float>& green = difference.values[1];
-  const std::vector<float>& blue = difference.values[2];
-  std::vector<float> mixed(red.size());
-  for (size_t i = 0; i < mixed.size(); ++i) mixed[i] = (red[i] + green[i] + blue[i]) / 3;
-  const float lightness = most_common(mixed);
-  for (size_t i = 0; i < mixed.size(); ++i) mixed[i] = red[i] - green[i];
-  const float red_green = most_common(mixed);
-  for (size_t i = 0; i < mixed.size(); ++i) mixed[i] = blue[i] - green[i];
-  const float blue_green = most_common(mixed);
-  const float of_green = lightness - (red_green + blue_green) / 3;
-  return {of_green + red_green, of_green, of_green + blue_green};
+std::array<float, 3> common_drift(const CellPlanes& difference, const CellGrid& grid) {
+  std::vector<float> lightness, red_green, blue_green;
+  for (int y = 0; y < grid.height; y += drift_stride) {
+    for (int x = 0; x < grid.width; x += drift_stride) {
+      const size_t cell = grid.index(x, y);
+      const float first = difference.values[0][cell];
+      if (difference.channels == 1) {
+        lightness.push_back(first);
+        continue;
+      }
+      const float green = difference.values[1][cell];
+      const float blue = difference.values[2][cell];
+      lightness.push_back((first + green + blue) / 3);
+      red_green.push_back(first - green);
+      blue_green.push_back(blue - green);
+    }
+  }
+  if (difference.channels == 1) return {most_common(lightness), 0, 0};
+  const float red_shift = most_common(red_green);
+  const float blue_shift = most_common(blue_green);
+  const float green = most_common(lightness) - (red_shift + blue_shift) / 3;
+  return {green + red_shift, green, green + blue_shift};
 }
 
 /// Whether a cell's difference can be the drift expected there, give or take the slack.
@@ -168,8 +187,9 @@ double refine_drift(const CellPlanes& difference, const CellGrid& grid, float sl
   CellPlanes sums = make_planes(difference.channels, blocks);
   std::vector<float> weight(blocks, 0);
   size_t agreeing = 0;
-  for (int y = 0; y < grid.height; ++y) {
-    for (int x = 0; x < grid.width; ++x) {
+  size_t asked = 0;
+  for (int y = 0; y < grid.height; y += drift_stride) {
+    for (int x = 0; x < grid.width; x += drift_stride, ++asked) {
       const size_t cell = grid.index(x, y);
       const size_t block =
           static_cast<size_t>(y / drift_block) * static_cast<size_t>(nx) + static_cast<size_t>(x / drift_block);
@@ -188,7 +208,7 @@ double refine_drift(const CellPlanes& difference, const CellGrid& grid, float sl
     for (size_t i = 0; i < blocks; ++i) sums.values[c][i] /= weight[i];
     expand_blocks(sums.values[c], nx, ny, grid, drift.values[c]);
   }
-  return static_cast<double>(agreeing) / static_cast<double>(grid.count());
+  return static_cast<double>(agreeing) / static_cast<double>(asked);
 }
 
 // ---- noise ----------------------------------------------------------------------------------------------------
@@ -251,14 +271,20 @@ std::array<float, noise_bins> noise_curve(const std::vector<float>& difference, 
   return curve;
 }
 
-/// The larger of the steps to the left and right, or up and down, squared and added.
-float squared_gradient(const std::vector<float>& values, const CellGrid& grid, int x, int y) {
-  const float here = values[grid.index(x, y)];
-  const float left = values[grid.index(std::max(x - 1, 0), y)] - here;
-  const float right = values[grid.index(std::min(x + 1, grid.width - 1), y)] - here;
-  const float up = values[grid.index(x, std::max(y - 1, 0))] - here;
-  const float down = values[grid.index(x, std::min(y + 1, grid.height - 1))] - here;
-  return std::max(left * left, right * right) + std::max(up * up, down * down);
+/// Of each cell of a row, the larger of the steps to the left and right, and up and down, squared and added.
+void squared_gradients(const std::vector<float>& values, const CellGrid& grid, int y, std::vector<float>& out) {
+  const float* here = values.data() + grid.index(0, y);
+  const float* above = values.data() + grid.index(0, std::max(y - 1, 0));
+  const float* below = values.data() + grid.index(0, std::min(y + 1, grid.height - 1));
+  const auto square = [](float v) { return v * v; };
+  out.resize(static_cast<size_t>(grid.width));
+  for (int x = 0; x < grid.width; ++x) out[x] = std::max(square(above[x] - here[x]), square(below[x] - here[x]));
+  const int last = grid.width - 1;
+  for (int x = 1; x < last; ++x) out[x] += std::max(square(here[x - 1] - here[x]), square(here[x + 1] - here[x]));
+  if (last > 0) {
+    out[0] += square(here[1] - here[0]);
+    out[last] += square(here[last - 1] - here[last]);
+  }
 }
 
 }  // namespace
@@ -278,7 +304,8 @@ CellFrame average_cells(const Image& image, const CellGrid& grid) {
   CellFrame frame;
   frame.lightness = make_planes(image.channels, grid.count());
   frame.level = make_planes(image.channels, grid.count());
-  std::vector<uint32_t> columns, cells(static_cast<size_t>(grid.width) * static_cast<size_t>(image.channels));
+  std::vector<uint16_t> columns;
+  std::vector<uint32_t> cells(static_cast<size_t>(grid.width) * static_cast<size_t>(image.channels));
   for (int y = 0; y < grid.height; ++y) {
     sum_cell_row(image, grid, y, columns, cells);
     for (int c = 0; c < image.channels; ++c) {
@@ -313,7 +340,8 @@ BackgroundModel learn_background(std::span<const Frame> frames) {
   model.level = make_planes(channels, grid.count());
   model.flicker.assign(grid.count(), 0);
   const size_t row_values = static_cast<size_t>(grid.width) * static_cast<size_t>(channels);
-  std::vector<uint32_t> columns, cells(row_values), total(row_values);
+  std::vector<uint16_t> columns;
+  std::vector<uint32_t> cells(row_values), total(row_values);
   std::vector<float> squares(row_values);
   const auto n = static_cast<float>(frames.size());
   const float per_cell = 1.0F / static_cast<float>(cell_pixels);
@@ -357,10 +385,11 @@ Residual compare(const BackgroundModel& background, const CellFrame& body) {
     std::vector<float>& difference = residual.difference.values[c];
     for (size_t i = 0; i < difference.size(); ++i) difference[i] = seen[i] - empty[i];
   }
-  residual.mean_drift = common_drift(residual.difference);
+  residual.mean_drift = common_drift(residual.difference, grid);
   residual.drift = make_planes(channels, grid.count());
   for (int c = 0; c < channels; ++c)
     std::fill_n(residual.drift.values[c].begin(), grid.count(), residual.mean_drift[c]);
+  std::vector<float> gradients;
   for (const float slack : drift_slack) {
     residual.drift_support = refine_drift(residual.difference, grid, slack, residual.drift);
   }
@@ -374,14 +403,16 @@ Residual compare(const BackgroundModel& background, const CellFrame& body) {
     // The scatter of the curve holds the body frame's noise and that of the background's mean; between the
     // background's frames there is only their own, so it adds what is special about a cell.
     for (int y = 0; y < grid.height; ++y) {
+      squared_gradients(background.lightness.values[c], grid, y, gradients);
+      const size_t row = grid.index(0, y);
+      const float* seen = body.level.values[c].data() + row;
+      float* variance = residual.variance.values[c].data() + row;
       for (int x = 0; x < grid.width; ++x) {
-        const size_t i = grid.index(x, y);
-        const float darker = std::min(level[i], body.level.values[c][i]);
-        float noise = curve[static_cast<size_t>(level[i] / 256 * noise_bins)];
-        if (!background.flicker.empty()) noise = std::max(noise, background.flicker[i]);
-        const float scale = darker + srgb_offset;
-        residual.variance.values[c][i] =
-            noise / (scale * scale) + shift * shift * squared_gradient(background.lightness.values[c], grid, x, y);
+        const float expected = level[row + x];
+        float noise = curve[static_cast<size_t>(expected * (noise_bins / 256.0F))];
+        if (!background.flicker.empty()) noise = std::max(noise, background.flicker[row + x]);
+        const float scale = std::min(expected, seen[x]) + srgb_offset;
+        variance[x] = noise / (scale * scale) + shift * shift * gradients[x];
       }
     }
   }

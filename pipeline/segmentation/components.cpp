@@ -15,31 +15,28 @@ int32_t root_of(std::vector<int32_t>& parent, int32_t i) {
 
 }  // namespace
 
-Components connected_components(std::span<const uint8_t> mask, int width, int height, uint8_t value,
+Components connected_components(std::span<const uint8_t> values, int width, int height, uint8_t low, uint8_t high,
                                 Connectivity connectivity) {
-  // Rows are cut into runs of equal value; a run joins those of the row above that it touches. Parts are numbered
-  // by their first run, as the smaller root wins.
-  struct Run {
-    int begin, end;  // columns, end excluded
-    int row;
-  };
-  std::vector<Run> runs;
+  // A run joins those of the row above that it touches. The smaller root wins, so that roots are first runs.
+  Components parts;
+  std::vector<Components::Run>& runs = parts.runs;
   std::vector<int32_t> parent;
   const int touch = connectivity == Connectivity::eight ? 1 : 0;
+  const auto within = [low, high](uint8_t v) { return v >= low && v <= high; };
   size_t above_begin = 0, above_end = 0;
   for (int y = 0; y < height; ++y) {
-    const uint8_t* row = mask.data() + static_cast<size_t>(y) * static_cast<size_t>(width);
+    const uint8_t* row = values.data() + static_cast<size_t>(y) * static_cast<size_t>(width);
     const size_t row_begin = runs.size();
     size_t above = above_begin;
     for (int x = 0; x < width;) {
-      if (row[x] != value) {
+      if (!within(row[x])) {
         ++x;
         continue;
       }
       const int begin = x;
-      while (x < width && row[x] == value) ++x;
+      while (x < width && within(row[x])) ++x;
       const auto number = static_cast<int32_t>(runs.size());
-      runs.push_back({begin, x, y});
+      runs.push_back({y, begin, x, 0});
       parent.push_back(number);
       while (above < above_end && runs[above].end + touch <= begin) ++above;
       for (size_t j = above; j < above_end && runs[j].begin < x + touch; ++j) {
@@ -51,8 +48,6 @@ Components connected_components(std::span<const uint8_t> mask, int width, int he
     above_begin = row_begin;
     above_end = runs.size();
   }
-  Components parts;
-  parts.label.assign(mask.size(), -1);
   std::vector<int32_t> number_of(runs.size(), -1);
   for (size_t i = 0; i < runs.size(); ++i) {
     const int32_t root = root_of(parent, static_cast<int32_t>(i));
@@ -60,12 +55,19 @@ Components connected_components(std::span<const uint8_t> mask, int width, int he
       number_of[root] = static_cast<int32_t>(parts.areas.size());
       parts.areas.push_back(0);
     }
-    const Run& run = runs[i];
-    int32_t* label = parts.label.data() + static_cast<size_t>(run.row) * static_cast<size_t>(width);
-    std::fill(label + run.begin, label + run.end, number_of[root]);
-    parts.areas[number_of[root]] += static_cast<size_t>(run.end - run.begin);
+    runs[i].part = number_of[root];
+    parts.areas[runs[i].part] += static_cast<size_t>(runs[i].end - runs[i].begin);
   }
   return parts;
+}
+
+std::vector<int32_t> part_raster(const Components& components, int width, int height) {
+  std::vector<int32_t> raster(static_cast<size_t>(width) * static_cast<size_t>(height), -1);
+  for (const Components::Run& run : components.runs) {
+    int32_t* row = raster.data() + static_cast<size_t>(run.row) * static_cast<size_t>(width);
+    std::fill(row + run.begin, row + run.end, run.part);
+  }
+  return raster;
 }
 
 }  // namespace booth::segmentation

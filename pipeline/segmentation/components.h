@@ -9,14 +9,21 @@ namespace booth::segmentation {
 
 enum class Connectivity { four, eight };
 
-/// The connected parts of a raster's cells that have a given value.
+/// The connected parts of a raster's cells that have a value in a given range, as runs along rows.
 struct Components {
-  std::vector<int32_t> label;  ///< a cell's part, numbered in scan order from 0; -1 for cells of another value
-  std::vector<size_t> areas;   ///< cells, by part
+  struct Run {
+    int row, begin, end;  ///< columns, end excluded
+    int32_t part;
+  };
+  std::vector<Run> runs;      ///< in scan order
+  std::vector<size_t> areas;  ///< cells, by part; parts are numbered in scan order of their first cells
 };
 
-/// @param mask  row by row, width × height
-Components connected_components(std::span<const uint8_t> mask, int width, int height, uint8_t value,
+/// @param values  row by row, width × height
+Components connected_components(std::span<const uint8_t> values, int width, int height, uint8_t low, uint8_t high,
                                 Connectivity connectivity);
+
+/// A cell's part, or −1 for cells of other values, row by row.
+std::vector<int32_t> part_raster(const Components& components, int width, int height);
 
 }  // namespace booth::segmentation

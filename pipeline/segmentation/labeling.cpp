@@ -217,44 +217,38 @@ void judge_patches(const CellGrid& grid, const Residual& residual, std::vector<f
 enum class Certainty : uint8_t { open, subject, background };
 
 std::vector<Certainty> certain_cells(const std::vector<float>& evidence, const CellGrid& grid) {
-  // Runs of clear cells of ± reach in both axes, as an erosion in two passes.
+  // Runs of equal clear cells that reach so far both ways, first along rows, then along columns, row by row.
   constexpr int reach = 2;
   constexpr float clear_background = -2;
-  std::vector<Certainty> clear(grid.count(), Certainty::open), rows(grid.count(), Certainty::open);
-  for (size_t i = 0; i < clear.size(); ++i) {
-    if (evidence[i] > clear_subject) clear[i] = Certainty::subject;
-    if (evidence[i] < clear_background) clear[i] = Certainty::background;
-  }
+  const auto certainty = [&](float e) {
+    return e > clear_subject ? Certainty::subject : e < clear_background ? Certainty::background : Certainty::open;
+  };
+  std::vector<Certainty> rows(evidence.size(), Certainty::open), certain(evidence.size(), Certainty::open);
+  std::vector<Certainty> clear(static_cast<size_t>(grid.width + 2 * reach));
   for (int y = 0; y < grid.height; ++y) {
-    int run = 0;  // equal clear cells that end here
-    for (int x = 0; x < grid.width + reach; ++x) {
-      if (x < grid.width) {
-        const bool same = x > 0 && clear[grid.index(x, y)] == clear[grid.index(x - 1, y)];
-        run = same ? run + 1 : 1;
-        // The image's border agrees with whatever is beside it.
-        if (x == 0) run = 1 + reach;
-      } else {
-        ++run;
-      }
-      const int center = x - reach;
-      if (center < 0) continue;
-      if (run >= 2 * reach + 1) rows[grid.index(center, y)] = clear[grid.index(center, y)];
+    const float* e = evidence.data() + grid.index(0, y);
+    for (int x = 0; x < grid.width; ++x) clear[x + reach] = certainty(e[x]);
+    // The image's border agrees with whatever is beside it.
+    for (int x = 0; x < reach; ++x) {
+      clear[x] = clear[reach];
+      clear[grid.width + reach + x] = clear[grid.width + reach - 1];
+    }
+    Certainty* out = rows.data() + grid.index(0, y);
+    for (int x = 0; x < grid.width; ++x) {
+      const bool same = clear[x] == clear[x + 2] && clear[x + 1] == clear[x + 2] && clear[x + 3] == clear[x + 2] &&
+                        clear[x + 4] == clear[x + 2];
+      out[x] = same ? clear[x + 2] : Certainty::open;
     }
   }
-  std::vector<Certainty> certain(grid.count(), Certainty::open);
-  for (int x = 0; x < grid.width; ++x) {
-    int run = 0;
-    for (int y = 0; y < grid.height + reach; ++y) {
-      if (y < grid.height) {
-        const bool same = y > 0 && rows[grid.index(x, y)] == rows[grid.index(x, y - 1)];
-        run = same ? run + 1 : 1;
-        if (y == 0) run = 1 + reach;
-      } else {
-        ++run;
-      }
-      const int center = y - reach;
-      if (center < 0) continue;
-      if (run >= 2 * reach + 1) certain[grid.index(x, center)] = rows[grid.index(x, center)];
+  for (int y = 0; y < grid.height; ++y) {
+    std::array<const Certainty*, 2 * reach + 1> at{};
+    for (int d = -reach; d <= reach; ++d)
+      at[d + reach] = rows.data() + grid.index(0, std::clamp(y + d, 0, grid.height - 1));
+    Certainty* out = certain.data() + grid.index(0, y);
+    for (int x = 0; x < grid.width; ++x) {
+      const Certainty here = at[reach][x];
+      const bool same = at[0][x] == here && at[1][x] == here && at[3][x] == here && at[4][x] == here;
+      out[x] = same ? here : Certainty::open;
     }
   }
   return certain;
@@ -305,14 +299,16 @@ CellMask cut(const std::vector<float>& evidence, const Residual& residual, const
 
 /// Parts that are tiny beside the largest are specks: noise, insects, a reflection.
 int remove_specks(CellMask& mask, const CellGrid& grid, double smallest_part) {
-  const Components parts = connected_components(mask, grid.width, grid.height, 1, Connectivity::eight);
+  const Components parts = connected_components(mask, grid.width, grid.height, 1, 1, Connectivity::eight);
   if (parts.areas.empty()) return 0;
   const size_t largest = *std::max_element(parts.areas.begin(), parts.areas.end());
   const auto smallest = static_cast<size_t>(smallest_part * static_cast<double>(largest));
   int kept = 0;
   for (const size_t area : parts.areas) kept += area >= smallest;
-  for (size_t i = 0; i < mask.size(); ++i) {
-    if (parts.label[i] >= 0 && parts.areas[parts.label[i]] < smallest) mask[i] = 0;
+  for (const Components::Run& run : parts.runs) {
+    if (parts.areas[run.part] >= smallest) continue;
+    std::fill(mask.begin() + static_cast<long>(grid.index(run.begin, run.row)),
+              mask.begin() + static_cast<long>(grid.index(run.end, run.row)), uint8_t{0});
   }
   return kept;
 }
@@ -321,14 +317,15 @@ int remove_specks(CellMask& mask, const CellGrid& grid, double smallest_part) {
 /// subject that happens to look like the background behind it.
 void fill_false_holes(CellMask& mask, const CellGrid& grid, const std::vector<float>& evidence,
                       const Residual& residual) {
-  const Components gaps = connected_components(mask, grid.width, grid.height, 0, Connectivity::four);
+  const Components gaps = connected_components(mask, grid.width, grid.height, 0, 0, Connectivity::four);
+  const std::vector<int32_t> gap_of = part_raster(gaps, grid.width, grid.height);
   const size_t n = gaps.areas.size();
   std::vector<uint8_t> open(n, 0);
   std::vector<double> rim(n, 0), price(n, 0), looks(n, 0);
   const BoundaryCost cost(residual, 1);
   for (int y = 0; y < grid.height; ++y) {
     for (int x = 0; x < grid.width; ++x) {
-      const int32_t gap = gaps.label[grid.index(x, y)];
+      const int32_t gap = gap_of[grid.index(x, y)];
       if (gap < 0) continue;
       if (x == 0 || y == 0 || x == grid.width - 1 || y == grid.height - 1) open[gap] = 1;
       looks[gap] += evidence[grid.index(x, y)];
@@ -346,7 +343,7 @@ void fill_false_holes(CellMask& mask, const CellGrid& grid, const std::vector<fl
   constexpr double faint_rim = 0.6;
   constexpr size_t few_cells = 12;
   for (size_t i = 0; i < mask.size(); ++i) {
-    const int32_t gap = gaps.label[i];
+    const int32_t gap = gap_of[i];
     if (gap < 0 || open[gap] != 0) continue;
     const bool faint = price[gap] > faint_rim * rim[gap];
     const bool doubtful = gaps.areas[gap] < few_cells && looks[gap] > -0.5 * static_cast<double>(gaps.areas[gap]);

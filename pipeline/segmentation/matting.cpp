@@ -80,7 +80,6 @@ class Band {
     const int32_t slot = slot_of_[cell(x, y)];
     return slot < 0 ? -1 : (slot * grid_.step + row_[y].rest) * grid_.step + column_[x].rest;
   }
-  bool holds(size_t cell) const { return slot_of_[cell] >= 0; }
 
   /// Calls visit(x, y, place, cell) for each pixel, in a fixed order.
   template <class Visit>
@@ -150,10 +149,15 @@ class Matte {
 
   Image coverage() const {
     Image out(body_.width, body_.height, 1);
-    for (int y = 0; y < body_.height; ++y) {
-      for (int x = 0; x < body_.width; ++x) {
-        const size_t cell = band_.cell(x, y);
-        if (!band_.holds(cell) && subject_[cell] != 0) out.at(x, y) = 255;
+    for (int cell_y = 0; cell_y * step_ < body_.height; ++cell_y) {
+      const int y0 = cell_y * step_;
+      uint8_t* first = out.pixel(0, y0);
+      for (int x = 0; x < body_.width; x += step_) {
+        if (subject_[band_.cell(x, y0)] == 0) continue;
+        std::fill(first + x, first + std::min(x + step_, body_.width), uint8_t{255});
+      }
+      for (int y = y0 + 1; y < std::min(y0 + step_, body_.height); ++y) {
+        std::copy(first, first + body_.width, out.pixel(0, y));
       }
     }
     band_.for_each([&](int x, int y, int32_t i, size_t) {
@@ -311,14 +315,16 @@ class Matte {
 void remove_crumbs(Image& coverage, const CellGrid& grid) {
   // A crumb is smaller than the cells that decided on the labels could have seen.
   const auto crumb = static_cast<size_t>(6 * grid.step * grid.step);
-  std::vector<uint8_t> mask(coverage.samples.size());
-  for (size_t i = 0; i < mask.size(); ++i) mask[i] = coverage.samples[i] >= 128;
-  const Components parts = connected_components(mask, coverage.width, coverage.height, 1, Connectivity::eight);
-  const Components gaps = connected_components(mask, coverage.width, coverage.height, 0, Connectivity::four);
-  for (size_t i = 0; i < mask.size(); ++i) {
-    if (parts.label[i] >= 0 && parts.areas[parts.label[i]] < crumb) coverage.samples[i] = 0;
-    if (gaps.label[i] >= 0 && gaps.areas[gaps.label[i]] < crumb) coverage.samples[i] = 255;
-  }
+  const auto repaint = [&](uint8_t low, uint8_t high, Connectivity connectivity, uint8_t value) {
+    const Components parts =
+        connected_components(coverage.samples, coverage.width, coverage.height, low, high, connectivity);
+    for (const Components::Run& run : parts.runs) {
+      if (parts.areas[run.part] >= crumb) continue;
+      std::fill(coverage.pixel(run.begin, run.row), coverage.pixel(run.begin, run.row) + (run.end - run.begin), value);
+    }
+  };
+  repaint(128, 255, Connectivity::eight, 0);
+  repaint(0, 127, Connectivity::four, 255);
 }
 
 }  // namespace

@@ -536,14 +536,15 @@ TEST(ConnectedComponents, FollowsTheNeighborhoodAskedFor) {
                                   0, 0, 0, 1, 1,
                                   1, 1, 0, 1, 0};
   // clang-format on
-  const auto eight = segmentation::connected_components(mask, 5, 4, 1, segmentation::Connectivity::eight);
+  const auto eight = segmentation::connected_components(mask, 5, 4, 1, 1, segmentation::Connectivity::eight);
   EXPECT_EQ(eight.areas, (std::vector<size_t>{2, 6, 2}));
-  const auto four = segmentation::connected_components(mask, 5, 4, 1, segmentation::Connectivity::four);
+  const auto four = segmentation::connected_components(mask, 5, 4, 1, 1, segmentation::Connectivity::four);
   EXPECT_EQ(four.areas, (std::vector<size_t>{1, 6, 1, 2}));
-  const auto gaps = segmentation::connected_components(mask, 5, 4, 0, segmentation::Connectivity::four);
+  const auto gaps = segmentation::connected_components(mask, 5, 4, 0, 0, segmentation::Connectivity::four);
   EXPECT_EQ(gaps.areas, (std::vector<size_t>{9, 1}));
-  EXPECT_EQ(gaps.label[19], 1);
-  EXPECT_EQ(gaps.label[0], -1);
+  const std::vector<int32_t> raster = segmentation::part_raster(gaps, 5, 4);
+  EXPECT_EQ(raster[19], 1);
+  EXPECT_EQ(raster[0], -1);
 }
 
 }  // namespace
