@@ -140,6 +140,7 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   if (!recording) return recording.error();
   JobReport report;
   auto capture = load_capture(*recording, work, &report.warnings);
+  if (work.stopped()) return Work::cancelled();
   if (!capture) return capture.error();
 
   const auto stage_progress = [&](std::string_view stage, double fraction) { clock.tell(stage, fraction); };

@@ -1,6 +1,7 @@
 #include "daemon/reconstruct_job.h"
 
 #include <gtest/gtest.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <filesystem>
@@ -135,56 +136,59 @@ TEST_F(ReconstructJob, SaysWhichShotIsMissing) {
   }
 }
 
-/// What befalls a file: its bytes before and after.
+/// What befalls a file.
 struct Damage {
   const char* name;
-  std::function<void(const fs::path&)> inflict;
+  void (*inflict)(const fs::path& file);
 };
 
 void rewrite(const fs::path& file, const std::string& bytes) { std::ofstream(file, std::ios::binary) << bytes; }
 
-TEST_F(ReconstructJob, AnyDamagedFileGivesOneClearErrorOrAnAvatarWithAWarning) {
-  const std::vector<Damage> damages{
-      {"deleted", [](const fs::path& file) { fs::remove(file); }},
-      {"emptied", [](const fs::path& file) { rewrite(file, ""); }},
-      {"truncated", [](const fs::path& file) { rewrite(file, text_of(file).substr(0, fs::file_size(file) / 2)); }},
-      {"scrambled",
-       [](const fs::path& file) {
-         std::string bytes = text_of(file);
-         std::mt19937 random(5);
-         for (size_t i = 0; i < bytes.size(); i += 1 + random() % 64) bytes[i] = static_cast<char>(random());
-         rewrite(file, bytes);
-       }},
-  };
-  const fs::path recording = folder_ / "recording";
+void erase(const fs::path& file) { fs::remove(file); }
+
+void truncate(const fs::path& file) { rewrite(file, text_of(file).substr(0, fs::file_size(file) / 2)); }
+
+void scramble(const fs::path& file) {
+  std::string bytes = text_of(file);
+  std::mt19937 random(5);
+  for (size_t i = 0; i < bytes.size(); i += 1 + random() % 64) bytes[i] = static_cast<char>(random());
+  rewrite(file, bytes);
+}
+
+class DamagedRecording : public ReconstructJob, public testing::WithParamInterface<Damage> {};
+
+TEST_P(DamagedRecording, GivesOneClearErrorOrAnAvatarWithAWarningWhicheverFileItIs) {
   std::vector<fs::path> files;
-  for (const auto& entry : fs::recursive_directory_iterator(recording))
+  for (const auto& entry : fs::recursive_directory_iterator(folder_ / "recording"))
     if (entry.is_regular_file()) files.push_back(entry.path());
   ASSERT_EQ(files.size(), 18U);
   std::sort(files.begin(), files.end());
 
   for (const fs::path& file : files) {
+    SCOPED_TRACE(file);
     const std::string original = text_of(file);
-    for (const Damage& damage : damages) {
-      SCOPED_TRACE(file.filename().string() + " " + damage.name);
-      damage.inflict(file);
-      const auto report = run();
-      if (report) {
-        const bool told = std::any_of(report->warnings.begin(), report->warnings.end(), [&](const std::string& w) {
-          return w.find(file.stem().string().substr(0, 7)) != std::string::npos;
-        });
-        EXPECT_TRUE(told) << "no warning names the file";
-        EXPECT_TRUE(fs::exists(folder_ / "out/avatar/avatar.dae"));
-      } else {
-        EXPECT_FALSE(report.error().message.empty());
-        EXPECT_EQ(report.error().message.find('\n'), std::string::npos) << report.error().message;
-        EXPECT_TRUE(nothing_is_left());
-      }
-      fs::remove_all(folder_ / "out");
-      rewrite(file, original);
+    GetParam().inflict(file);
+    const auto report = run();
+    const auto names_the_file = [&](const std::string& sentence) {
+      return sentence.find(file.filename().string()) != std::string::npos;
+    };
+    if (report) {
+      EXPECT_TRUE(std::any_of(report->warnings.begin(), report->warnings.end(), names_the_file));
+      EXPECT_TRUE(fs::exists(folder_ / "out/avatar/avatar.dae"));
+    } else {
+      EXPECT_TRUE(names_the_file(report.error().message)) << report.error().message;
+      EXPECT_EQ(report.error().message.find('\n'), std::string::npos) << report.error().message;
+      EXPECT_TRUE(nothing_is_left());
     }
+    fs::remove_all(folder_ / "out");
+    rewrite(file, original);
   }
 }
+
+INSTANTIATE_TEST_SUITE_P(EveryFile, DamagedRecording,
+                         testing::Values(Damage{"deleted", erase}, Damage{"truncated", truncate},
+                                         Damage{"scrambled", scramble}),
+                         [](const auto& damage) { return damage.param.name; });
 
 }  // namespace
 }  // namespace booth
