@@ -25,6 +25,7 @@ constexpr double arm_share = 0.42;          // shoulder to fingertip
 constexpr double longest_arm_share = 0.48;  // what is longer holds something
 constexpr double shoulder_half_share = 0.105;   // middle to shoulder joint: half the biacromial breadth less 0.01
 constexpr double shoulder_cover_share = 0.031;  // shoulder joint to the skin above and beside it
+constexpr double shoulder_drop_share = 0.055;   // from the lowest joint of the neck down to the shoulder joints
 constexpr double hip_half_share = 0.060;        // middle to hip joint
 constexpr double hip_height_share = 0.52;       // of adults
 constexpr double hip_of_crotch = 1.14;          // hip joints' height, of the crotch's
@@ -368,7 +369,8 @@ Vector3d shoulder_joint(const Body& body, const std::vector<double>& outline, do
     if (!(y > lowest)) continue;
     const Vector3d p(x, y, depth_z);
     const auto squared = [](double v) { return v * v; };
-    double cost = squared((aside - shoulder_half_share) / 0.012);
+    const double drop = (trunk.neck.y() - p.y()) / body.stature;
+    double cost = squared((aside - shoulder_half_share) / 0.012) + squared((drop - shoulder_drop_share) / 0.02);
     if (elbow) cost += squared(((p - *elbow).norm() / body.stature - upper_arm_share) / 0.015);
     if (cost < least) {
       least = cost;
@@ -514,23 +516,69 @@ ArmJoints trace_arm(const Body& body, const std::vector<uint32_t>& limb, const s
   return arm;
 }
 
-/// An arm that cannot be told from the trunk: hanging straight down from the shoulder.
-ArmJoints hanging_arm(const Body& body, const std::vector<double>& outline, double middle, size_t side,
-                      const TrunkJoints& trunk) {
+/// The part of an arm between shoulder and hand that stands clear of the trunk seen from the front, from below upwards:
+/// what remains visible when the hand touches the body.
+std::vector<Station> clear_arm(const Body& body, size_t side, double middle, double low, double high) {
+  const Grid& grid = body.interior.grid;
+  std::vector<Station> best, current;
+  for (double y = low; y < high; y += 2 * body.voxel()) {
+    const int j = body.row(y);
+    const auto filled = [&](int i) {
+      for (int k = 0; k < grid.size[2]; ++k)
+        if (body.solid(i, j, k)) return true;
+      return false;
+    };
+    int outermost = side == left ? grid.size[0] - 1 : 0;
+    while (outermost >= 0 && outermost < grid.size[0] && !filled(outermost)) outermost += side == left ? -1 : 1;
+    const Run run = run_at(body, y, grid.point(outermost, 0, 0).x());
+    if (run.empty() || (run.low < middle && run.high > middle)) {
+      current.clear();
+      continue;
+    }
+    const double x = 0.5 * (run.low + run.high);
+    const Vector3d centre = centre_near(body, {x, y, 0}, {0.5 * run.width(), 1.5 * body.voxel(), 10 * body.stature});
+    current.push_back({centre, 0, 0});
+    if (current.size() > best.size()) best = current;
+  }
+  return best;
+}
+
+/// An arm whose hand cannot be told from the body: what stands clear of it is followed, the rest hangs straight down
+/// by proportions.
+ArmJoints hidden_arm(const Body& body, const std::vector<double>& outline, double middle, size_t side,
+                     const TrunkJoints& trunk) {
   const double cover = shoulder_cover_share * body.stature;
+  const double length = arm_share * body.stature;
   ArmJoints arm;
   arm.shoulder = shoulder_joint(body, outline, cover, middle, side, trunk, std::nullopt);
   const double near = 0.02 * body.stature;
   const auto below = [&](double share) {
     // As far out as the body goes there, less what covers the bone.
-    const double y = arm.shoulder.y() - share * arm_share * body.stature;
+    const double y = arm.shoulder.y() - share * length;
     const Run run = run_at(body, y, middle);
     const double x = run.empty() ? arm.shoulder.x() : (side == left ? run.high : run.low) - sign(side) * cover;
     return Vector3d(x, y, centre_near(body, {x, y, arm.shoulder.z()}, {near, near, body.stature}).z());
   };
-  arm.elbow = below(1 - hand_of_arm - forearm_of_arm);
-  arm.wrist = below(1 - hand_of_arm);
-  arm.fingers = below(1);
+  const std::vector<Station> clear = clear_arm(body, side, middle, trunk.hips.y(), arm.shoulder.y() - cover);
+  constexpr double enough_share = 0.08;  // clear over less of its length, an arm tells nothing of its bend
+  if (clear.size() < 3 || clear.back().p.y() - clear.front().p.y() < enough_share * body.stature) {
+    arm.elbow = below(1 - hand_of_arm - forearm_of_arm);
+    arm.wrist = below(1 - hand_of_arm);
+    arm.fingers = below(1);
+    return arm;
+  }
+  double seen = (arm.shoulder - clear.back().p).norm();
+  for (size_t s = 1; s < clear.size(); ++s) seen += (clear[s].p - clear[s - 1].p).norm();
+  const Vector3d onwards = (clear[0].p - clear[2].p).normalized();
+  const double hidden = std::max(0.0, length - seen);
+  std::vector<Station> line{{clear[0].p + hidden * onwards, 0, 0}};
+  if (hidden > 0) continue_to(body, clear[0].p, line);
+  for (size_t s = 1; s < clear.size(); ++s) continue_to(body, clear[s].p, line);
+  continue_to(body, arm.shoulder, line);
+  const double wrist = hand_of_arm * line.back().along;
+  arm.fingers = line.front().p;
+  arm.wrist = point_along(line, wrist);
+  arm.elbow = find_elbow(body, line, wrist);
   return arm;
 }
 
@@ -661,7 +709,7 @@ NeckMeasure find_neck(const Body& body, double x) {
 double hip_height(const Body& body, const NeckMeasure& neck, std::optional<double> crotch,
                   std::vector<std::string>& warnings) {
   const double head_share = neck.seen ? 1 - (neck.y - body.floor) / body.stature : adult_head_share;
-  const double usual = std::clamp(hip_height_share - (head_share - adult_head_share), 0.44, 0.53);
+  const double usual = std::clamp(hip_height_share - (head_share - adult_head_share), 0.42, 0.53);
   if (!crotch) return body.height(usual);
   const double crotch_height = *crotch - body.floor;
   const double measured = hip_of_crotch * crotch_height / body.stature;
@@ -863,9 +911,9 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
     if (arm_limb[side]) {
       arm = trace_arm(body, limbs[*arm_limb[side]], outline, trunk.neck.x(), side, trunk, result.warnings);
     } else {
-      arm = hanging_arm(body, outline, trunk.neck.x(), side, trunk);
+      arm = hidden_arm(body, outline, trunk.neck.x(), side, trunk);
       result.warnings.push_back(std::string("the ") + name(side) +
-                                " arm cannot be told from the trunk; it was placed by proportions");
+                                " hand cannot be told from the body; the arm was placed by proportions");
     }
     arm.clavicle = {trunk.neck.x() + sign(side) * 0.018 * body.stature,
                     arm.shoulder.y() + 0.3 * (trunk.neck.y() - arm.shoulder.y()),
