@@ -150,37 +150,38 @@ bool agrees_with(const CellPlanes& difference, const CellPlanes& drift, size_t c
          std::abs(deviation[2] - deviation[1]) < drift_chroma_slack;
 }
 
-/// Block values at every cell, linear between the blocks' centres.
-void expand_blocks(const std::vector<float>& blocks, int nx, int ny, const CellGrid& grid, std::vector<float>& out) {
-  out.resize(grid.count());
-  const auto place = [](int cell, int blocks_along, int* first, float* fraction) {
-    const float at = (static_cast<float>(cell) + 0.5F) / drift_block - 0.5F;
-    *first = std::clamp(static_cast<int>(std::floor(at)), 0, std::max(0, blocks_along - 2));
-    *fraction = blocks_along < 2 ? 0 : std::clamp(at - static_cast<float>(*first), 0.0F, 1.0F);
-  };
-  std::vector<float> row(static_cast<size_t>(nx));
-  for (int y = 0; y < grid.height; ++y) {
-    int by = 0;
-    float fy = 0;
-    place(y, ny, &by, &fy);
-    const float* upper = blocks.data() + static_cast<size_t>(by) * static_cast<size_t>(nx);
-    const float* lower = ny < 2 ? upper : upper + nx;
-    for (int x = 0; x < nx; ++x) row[x] = upper[x] + fy * (lower[x] - upper[x]);
-    for (int x = 0; x < grid.width; ++x) {
-      int bx = 0;
-      float fx = 0;
-      place(x, nx, &bx, &fx);
-      const float left = row[bx];
-      const float right = nx < 2 ? left : row[bx + 1];
-      out[grid.index(x, y)] = left + fx * (right - left);
+/// Block values at every cell of every row_stride-th row, linear between the blocks' centres.
+void expand_blocks(const std::vector<float>& blocks, int nx, int ny, const CellGrid& grid, int row_stride,
+                   std::vector<float>& out) {
+  // Half a block at either end repeats the first or last value: one more block there makes all alike.
+  std::vector<float> row(static_cast<size_t>(nx) + 2);
+  constexpr int half = drift_block / 2;
+  for (int y = 0; y < grid.height; y += row_stride) {
+    const int upper = std::clamp((y + half) / drift_block - 1, 0, ny - 1);
+    const int lower = std::min((y + half) / drift_block, ny - 1);
+    const float down = (static_cast<float>((y + half) % drift_block) + 0.5F) / drift_block;
+    const float* a = blocks.data() + static_cast<size_t>(upper) * static_cast<size_t>(nx);
+    const float* b = blocks.data() + static_cast<size_t>(lower) * static_cast<size_t>(nx);
+    for (int x = 0; x < nx; ++x) row[x + 1] = a[x] + down * (b[x] - a[x]);
+    row.front() = row[1];
+    row.back() = row[nx];
+    float* cells = out.data() + grid.index(0, y);
+    for (int n = 0; n <= nx; ++n) {
+      const float slope = (row[n + 1] - row[n]) / drift_block;
+      const float start = row[n] + 0.5F * slope;
+      const int first = n * drift_block - half;
+      const int end = std::min(first + drift_block, grid.width);
+      for (int x = std::max(first, 0); x < end; ++x) cells[x] = start + slope * static_cast<float>(x - first);
     }
   }
 }
 
 /// Replaces a drift by the mean difference, block by block and smoothed over the image, of the cells that agree with
 /// it. Where few agree, the neighbourhood's drift carries over.
+/// @param row_stride  the new drift is written to every so many rows
 /// @return share of the cells that agreed
-double refine_drift(const CellPlanes& difference, const CellGrid& grid, float slack, CellPlanes& drift) {
+double refine_drift(const CellPlanes& difference, const CellGrid& grid, float slack, int row_stride,
+                    CellPlanes& drift) {
   const int nx = (grid.width + drift_block - 1) / drift_block;
   const int ny = (grid.height + drift_block - 1) / drift_block;
   const size_t blocks = static_cast<size_t>(nx) * static_cast<size_t>(ny);
@@ -206,7 +207,7 @@ double refine_drift(const CellPlanes& difference, const CellGrid& grid, float sl
   for (int c = 0; c < difference.channels; ++c) {
     gaussian_blur(sums.values[c], nx, ny, drift_smoothing_blocks);
     for (size_t i = 0; i < blocks; ++i) sums.values[c][i] /= weight[i];
-    expand_blocks(sums.values[c], nx, ny, grid, drift.values[c]);
+    expand_blocks(sums.values[c], nx, ny, grid, row_stride, drift.values[c]);
   }
   return static_cast<double>(agreeing) / static_cast<double>(asked);
 }
@@ -390,8 +391,10 @@ Residual compare(const BackgroundModel& background, const CellFrame& body) {
   for (int c = 0; c < channels; ++c)
     std::fill_n(residual.drift.values[c].begin(), grid.count(), residual.mean_drift[c]);
   std::vector<float> gradients;
-  for (const float slack : drift_slack) {
-    residual.drift_support = refine_drift(residual.difference, grid, slack, residual.drift);
+  for (size_t n = 0; n < drift_slack.size(); ++n) {
+    // In between, the drift is needed only where it is asked about.
+    const int row_stride = n + 1 < drift_slack.size() ? drift_stride : 1;
+    residual.drift_support = refine_drift(residual.difference, grid, drift_slack[n], row_stride, residual.drift);
   }
   for (int c = 0; c < channels; ++c) {
     std::vector<float>& difference = residual.difference.values[c];

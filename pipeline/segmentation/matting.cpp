@@ -161,7 +161,7 @@ class Matte {
       }
     }
     band_.for_each([&](int x, int y, int32_t i, size_t) {
-      out.at(x, y) = static_cast<uint8_t>(std::lround(255 * std::clamp(alpha_[i], 0.0F, 1.0F)));
+      out.at(x, y) = static_cast<uint8_t>(255 * std::clamp(alpha_[i], 0.0F, 1.0F) + 0.5F);
     });
     return out;
   }
