@@ -18,8 +18,8 @@ using Color = std::array<float, 3>;  // linear light; grey uses the first only
 struct Ring {
   float from_px, to_px;
 };
-/// First from the labels' outline, which follows cells, then twice from the outline found before.
-constexpr std::array<Ring, 3> rings{{{2.0F, 4.5F}, {1.5F, 3.5F}, {1.5F, 3.5F}}};
+/// First from the labels' outline, which follows cells, then from the outline found before.
+constexpr std::array<Ring, 2> rings{{{2.0F, 4.5F}, {1.5F, 3.5F}}};
 /// Half the width of the band in which coverage is estimated, and how far the outline may leave the labels'.
 constexpr float band_px = 3.5F;
 /// Contrast |F − B| in linear light at which colours and the outline found before are believed alike.
