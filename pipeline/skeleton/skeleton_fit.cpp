@@ -823,6 +823,150 @@ Skeleton build(const TrunkJoints& trunk, const std::array<ArmJoints, 2>& arms, c
   return tree.take();
 }
 
+// ---- the whole ----------------------------------------------------------------------------------------------------
+
+struct Subject {
+  Body body;
+  Ends ends;
+};
+
+Result<Subject> find_subject(const Mesh& mesh, const SkeletonOptions& options) {
+  auto measured = measure(mesh, options);
+  if (!measured) return measured.error();
+  Subject subject{std::move(measured).value(), {}};
+  Body& body = subject.body;
+  const auto core = find_core(body);
+  if (!core) return not_riggable("the shape is empty at the height of a trunk");
+  body.from_core = geodesics_from(body.interior, std::array{GeodesicSource{*core, 0}});
+  constexpr double least_prominence = 0.04;  // of stature
+  const auto ends =
+      classify(body, find_extremities(body.interior, body.from_core,
+                                      static_cast<uint32_t>(10 * least_prominence * body.stature / body.voxel())));
+  if (!ends) return ends.error();
+  subject.ends = *ends;
+  if (!(subject.ends.hand[left] && subject.ends.hand[right]) && !subject.ends.foot[left])
+    return not_riggable("neither two arms nor two legs stand out from the shape");
+  return subject;
+}
+
+/// By how much the person is turned about the vertical away from facing +Z; 0 unless hands and feet agree on it.
+double turn_of(const Subject& subject) {
+  const Ends& ends = subject.ends;
+  if (!ends.hand[left] || !ends.hand[right] || !ends.foot[left]) return 0;
+  const auto turn = [&](size_t left_tip, size_t right_tip) {
+    const Vector3d across = subject.body.interior.point(left_tip) - subject.body.interior.point(right_tip);
+    return std::atan2(-across.z(), across.x());
+  };
+  const double hands = turn(*ends.hand[left], *ends.hand[right]), feet = turn(*ends.foot[left], *ends.foot[right]);
+  constexpr double agreement = 0.2;  // radians; a step forward turns the feet alone
+  return std::abs(hands - feet) < agreement ? 0.5 * (hands + feet) : 0;
+}
+
+Mesh turned(Mesh mesh, const Eigen::Isometry3d& turn) {
+  for (auto& p : mesh.positions) p = (turn * p.cast<double>()).cast<float>();
+  return mesh;
+}
+
+std::array<LegJoints, 2> place_legs(const Body& body, const std::array<std::vector<Vector3d>, 2>& rows,
+                                    const std::array<std::vector<uint32_t>, 2>& limbs, const TrunkJoints& trunk,
+                                    std::vector<std::string>& warnings) {
+  if (limbs[left].empty())
+    warnings.emplace_back("the legs cannot be told apart (a long skirt?); they were placed by proportions");
+  std::array<LegJoints, 2> legs;
+  const double hip_y = trunk.pelvis.y(), ankle_y = body.height(ankle_height_share);
+  const double knee_y = ankle_y + knee_of_leg * (hip_y - ankle_y);
+  const double near = 0.02 * body.stature;
+  for (const size_t side : {left, right}) {
+    LegJoints& leg = legs[side];
+    const Vector3d usual_hip = trunk.pelvis + Vector3d(sign(side) * hip_half_share * body.stature, 0, 0);
+    const auto ankle = extrapolate(rows[side], body.height(0.08), body.height(0.14), ankle_y);
+    leg.ankle = ankle.value_or(Vector3d(usual_hip.x(), ankle_y, usual_hip.z()));
+    leg.hip = usual_hip;
+    if (const auto axis = extrapolate(rows[side], knee_y, body.height(1), hip_y))
+      leg.hip.x() = 0.5 * (usual_hip.x() + axis->x());
+    leg.hip.z() = 0.7 * trunk.pelvis.z() + 0.3 * leg.ankle.z();
+    const auto knee = extrapolate(rows[side], knee_y - near, knee_y + near, knee_y);
+    leg.knee = knee.value_or(leg.ankle + knee_of_leg * (leg.hip - leg.ankle));
+    add_foot(body, limbs[side], leg);
+  }
+  return legs;
+}
+
+std::array<ArmJoints, 2> place_arms(const Body& body, const std::array<std::vector<uint32_t>, 2>& limbs,
+                                    const TrunkJoints& trunk, std::vector<std::string>& warnings) {
+  std::array<ArmJoints, 2> arms;
+  const std::vector<double> outline = outline_from_above(body);
+  const double middle = trunk.neck.x();
+  for (const size_t side : {left, right}) {
+    ArmJoints& arm = arms[side];
+    if (!limbs[side].empty()) {
+      arm = trace_arm(body, limbs[side], outline, middle, side, trunk, warnings);
+    } else {
+      arm = hidden_arm(body, outline, middle, side, trunk);
+      warnings.push_back(std::string("the ") + name(side) +
+                         " hand cannot be told from the body; the arm was placed by proportions");
+    }
+    arm.clavicle = {middle + sign(side) * 0.018 * body.stature,
+                    arm.shoulder.y() + 0.3 * (trunk.neck.y() - arm.shoulder.y()),
+                    0.5 * (trunk.neck.z() + arm.shoulder.z())};
+  }
+  return arms;
+}
+
+FittedSkeleton place_joints(const Subject& subject) {
+  const Body& body = subject.body;
+  const Ends& ends = subject.ends;
+  FittedSkeleton result;
+
+  std::vector<size_t> tips{ends.head};
+  for (const auto& pair : {ends.hand, ends.foot})
+    for (const auto& tip : pair)
+      if (tip) tips.push_back(*tip);
+  std::vector<std::vector<uint32_t>> limbs = limbs_of(body.interior, body.from_core, tips);
+  std::array<std::vector<uint32_t>, 2> arm_limbs, leg_limbs;
+  size_t next = 1;
+  for (const size_t side : {left, right})
+    if (ends.hand[side]) arm_limbs[side] = std::move(limbs[next++]);
+  for (const size_t side : {left, right})
+    if (ends.foot[side]) leg_limbs[side] = std::move(limbs[next++]);
+
+  // Legs up to the crotch, and with it the height of the hips.
+  std::array<std::vector<Vector3d>, 2> rows;
+  for (const size_t side : {left, right}) rows[side] = leg_rows(body, leg_limbs[side], body.height(0.6));
+  std::optional<double> crotch;
+  if (!rows[left].empty() && !rows[right].empty()) {
+    crotch = where_legs_meet(body, rows[left], rows[right]);
+    for (auto& side : rows)
+      std::erase_if(side, [&](const Vector3d& p) { return p.y() > *crotch - 0.02 * body.stature; });
+  }
+  const double head_x = middle_of_head(body, ends);
+  const NeckMeasure neck = find_neck(body, head_x);
+  if (!neck.seen) result.warnings.emplace_back("no neck was seen (long hair or a hood?); it was placed by proportions");
+  const double hip_y = hip_height(body, neck, crotch, result.warnings);
+  double hip_x = head_x;
+  if (const Run run = run_at(body, hip_y, head_x); !run.empty()) {
+    // The trunk's middle; arms that touch it there are cut off at what hips measure.
+    const double half = 0.14 * body.stature;
+    hip_x = 0.5 * (std::max(run.low, head_x - half) + std::min(run.high, head_x + half));
+  }
+
+  TrunkJoints trunk = place_trunk(body, ends, neck, head_x, hip_y, hip_x);
+  std::array<LegJoints, 2> legs = place_legs(body, rows, leg_limbs, trunk, result.warnings);
+  std::array<ArmJoints, 2> arms = place_arms(body, arm_limbs, trunk, result.warnings);
+
+  for (Vector3d* p : {&trunk.hips, &trunk.spine, &trunk.spine1, &trunk.spine2, &trunk.neck, &trunk.head, &trunk.crown})
+    *p = pulled_inside(body, *p);
+  for (const size_t side : {left, right}) {
+    ArmJoints& arm = arms[side];
+    LegJoints& leg = legs[side];
+    for (Vector3d* p :
+         {&arm.clavicle, &arm.shoulder, &arm.elbow, &arm.wrist, &leg.hip, &leg.knee, &leg.ankle, &leg.ball})
+      *p = pulled_inside(body, *p);
+  }
+  result.skeleton = build(trunk, arms, legs);
+  return result;
+}
+
 }  // namespace
 
 Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& options, const Work& work) {
@@ -830,105 +974,22 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
     return Error{ErrorCode::invalid_argument,
                  "skeleton.cells: " + std::to_string(options.cells) + ", expected 100 … 400"};
   if (const auto checked = check(mesh); !checked) return checked.error();
-  auto measured = measure(mesh, options);
-  if (!measured) return measured.error();
-  Body body = std::move(measured).value();
+  auto subject = find_subject(mesh, options);
+  if (!subject) return subject.error();
   if (work.stopped()) return Work::cancelled();
 
-  const auto core = find_core(body);
-  if (!core) return not_riggable("the shape is empty at the height of a trunk");
-  body.from_core = geodesics_from(body.interior, std::array{GeodesicSource{*core, 0}});
-  const auto share_steps = [&](double share) {
-    return static_cast<uint32_t>(10 * share * body.stature / body.voxel());
-  };
-  const auto ends = classify(body, find_extremities(body.interior, body.from_core, share_steps(0.04)));
-  if (!ends) return ends.error();
-  const bool hands = ends->hand[left] && ends->hand[right], feet = ends->foot[left].has_value();
-  if (!hands && !feet) return not_riggable("neither two arms nor two legs stand out from the shape");
-  if (work.stopped()) return Work::cancelled();
-
-  FittedSkeleton result;
-  std::vector<size_t> tips{ends->head};
-  std::array<std::optional<size_t>, 2> arm_limb, leg_limb;
-  for (const size_t side : {left, right}) {
-    if (ends->hand[side]) {
-      arm_limb[side] = tips.size();
-      tips.push_back(*ends->hand[side]);
-    }
-    if (ends->foot[side]) {
-      leg_limb[side] = tips.size();
-      tips.push_back(*ends->foot[side]);
-    }
+  // Who stands turned is measured facing +Z and turned back.
+  Eigen::Isometry3d world_from_facing = Eigen::Isometry3d::Identity();
+  constexpr double noticeable_turn = 0.15, largest_turn = 0.9;  // radians
+  if (const double turn = turn_of(*subject); std::abs(turn) > noticeable_turn && std::abs(turn) < largest_turn) {
+    world_from_facing.rotate(Eigen::AngleAxisd(turn, Vector3d::UnitY()));
+    subject = find_subject(turned(mesh, world_from_facing.inverse()), options);
+    if (!subject) return subject.error();
+    if (work.stopped()) return Work::cancelled();
   }
-  const auto limbs = limbs_of(body.interior, body.from_core, tips);
-
-  // Legs up to the crotch, and with it the height of the hips.
-  std::array<std::vector<Vector3d>, 2> rows;
-  std::optional<double> crotch;
-
-  if (feet) {
-    for (const size_t side : {left, right}) rows[side] = leg_rows(body, limbs[*leg_limb[side]], body.height(0.6));
-    crotch = where_legs_meet(body, rows[left], rows[right]);
-    for (const size_t side : {left, right})
-      std::erase_if(rows[side], [&](const Vector3d& p) { return p.y() > *crotch - 0.02 * body.stature; });
-  }
-  const double head_x = middle_of_head(body, *ends);
-  const NeckMeasure neck = find_neck(body, head_x);
-  if (!neck.seen) result.warnings.emplace_back("no neck was seen (long hair or a hood?); it was placed by proportions");
-  const double hip_y = hip_height(body, neck, crotch, result.warnings);
-  double hip_x = head_x;
-  if (const Run run = run_at(body, hip_y, hip_x); !run.empty()) {
-    // The trunk's middle; arms that touch it there are cut off at what hips measure.
-    const double half = 0.14 * body.stature;
-    hip_x = 0.5 * (std::max(run.low, hip_x - half) + std::min(run.high, hip_x + half));
-  }
-  TrunkJoints trunk = place_trunk(body, *ends, neck, head_x, hip_y, hip_x);
-
-  std::array<LegJoints, 2> legs;
-  if (!feet)
-    result.warnings.emplace_back("the legs cannot be told apart (a long skirt?); they were placed by proportions");
-  for (const size_t side : {left, right}) {
-    LegJoints& leg = legs[side];
-    const double ankle_y = body.height(ankle_height_share);
-    const Vector3d usual_hip(hip_x + sign(side) * hip_half_share * body.stature, hip_y, trunk.pelvis.z());
-    const auto ankle = feet ? extrapolate(rows[side], body.height(0.08), body.height(0.14), ankle_y) : std::nullopt;
-    leg.ankle = ankle.value_or(Vector3d(usual_hip.x(), ankle_y, usual_hip.z()));
-    const double knee_y = ankle_y + knee_of_leg * (hip_y - ankle_y);
-    const auto axis = feet ? extrapolate(rows[side], knee_y, body.height(1), hip_y) : std::nullopt;
-    leg.hip = usual_hip;
-    if (axis) leg.hip.x() = 0.5 * (usual_hip.x() + axis->x());
-    leg.hip.z() = 0.7 * trunk.pelvis.z() + 0.3 * leg.ankle.z();
-    const double near = 0.02 * body.stature;
-    const auto bend = feet ? extrapolate(rows[side], knee_y - near, knee_y + near, knee_y) : std::nullopt;
-    leg.knee = bend.value_or(leg.ankle + knee_of_leg * (leg.hip - leg.ankle));
-    add_foot(body, feet ? limbs[*leg_limb[side]] : std::vector<uint32_t>(), leg);
-  }
-
-  std::array<ArmJoints, 2> arms;
-  const std::vector<double> outline = outline_from_above(body);
-  for (const size_t side : {left, right}) {
-    ArmJoints& arm = arms[side];
-    if (arm_limb[side]) {
-      arm = trace_arm(body, limbs[*arm_limb[side]], outline, trunk.neck.x(), side, trunk, result.warnings);
-    } else {
-      arm = hidden_arm(body, outline, trunk.neck.x(), side, trunk);
-      result.warnings.push_back(std::string("the ") + name(side) +
-                                " hand cannot be told from the body; the arm was placed by proportions");
-    }
-    arm.clavicle = {trunk.neck.x() + sign(side) * 0.018 * body.stature,
-                    arm.shoulder.y() + 0.3 * (trunk.neck.y() - arm.shoulder.y()),
-                    0.5 * (trunk.neck.z() + arm.shoulder.z())};
-  }
-
-  for (Vector3d* p : {&trunk.hips, &trunk.spine, &trunk.spine1, &trunk.spine2, &trunk.neck, &trunk.head, &trunk.crown})
-    *p = pulled_inside(body, *p);
-  for (const size_t side : {left, right}) {
-    for (Vector3d* p : {&arms[side].clavicle, &arms[side].shoulder, &arms[side].elbow, &arms[side].wrist})
-      *p = pulled_inside(body, *p);
-    for (Vector3d* p : {&legs[side].hip, &legs[side].knee, &legs[side].ankle, &legs[side].ball})
-      *p = pulled_inside(body, *p);
-  }
-  result.skeleton = build(trunk, arms, legs);
+  FittedSkeleton result = place_joints(*subject);
+  Joint& root = result.skeleton.joints.front();
+  root.parent_from_joint = world_from_facing * root.parent_from_joint;
   work.report(1);
   return result;
 }

@@ -27,16 +27,17 @@ struct FittedSkeleton {
 ///
 /// Axes at rest: every joint's +Y runs along its bone, to the next joint of the limb (to the middle of the hand, the
 /// tip of the foot, the crown for those that end it; HeadTop_End turns like Head). +Z is the direction across it that
-/// is nearest to forward (world +Z), for the feet and toes to up; +X = Y × Z completes a right-handed frame. So +X is
-/// the hinge of knees and elbows, and turning twins of both sides about their X by the same angle gives mirrored poses
-/// (about Y and Z: by opposite angles).
+/// is nearest to forward (world +Z, or where a person who stands turned faces), for the feet and toes to up; +X = Y × Z
+/// completes a right-handed frame. So +X is the hinge of knees and elbows, and turning twins of both sides about their
+/// X by the same angle gives mirrored poses (about Y and Z: by opposite angles).
 ///
-/// @param mesh  closed, world frame, facing +Z, standing upright; it need not stand on y = 0, small parts beside the
-///              body are ignored
+/// @param mesh  closed, world frame, facing +Z, turned from it by no more than 50°, standing upright; it need not stand
+/// on
+///              y = 0, small parts beside the body are ignored
 /// @return every joint lies inside the mesh
 /// @error not_riggable  the shape has no recognisable head, hands and feet; the message says which and why
 /// @error invalid_argument  options out of range, or a mesh that fails its check
-/// Cost: O(cells³), about 0.1 s and 30 MB at 200 cells.
+/// Cost: O(cells³), about 0.1 s and 30 MB at 200 cells; twice that for who stands turned by more than 9°.
 /// Source: own; segment lengths from P. de Leva, "Adjustments to Zatsiorsky-Seluyanov's segment inertia parameters",
 /// J. Biomechanics 29(9), 1996, and R. Drillis, R. Contini, "Body segment parameters", 1966 (in D. Winter,
 /// "Biomechanics and motor control of human movement"). Compare I. Baran, J. Popović, "Automatic rigging and animation

@@ -261,15 +261,36 @@ TEST(SkeletonFit, MovesWithTheBody) {
     EXPECT_LT((moved.joints.at(name) - step.cast<double>() - p).norm(), 0.004 * stature_m) << name;
 }
 
-TEST(SkeletonFit, StandsABodyThatIsTurnedALittle) {
-  Person person = synthetic::person();
-  const Eigen::Matrix3d turn = Eigen::AngleAxisd(0.2, Vector3d::UnitY()).toRotationMatrix();
-  for (auto& capsule : person.body) {
-    capsule.from = turn * capsule.from;
-    capsule.to = turn * capsule.to;
+TEST(SkeletonFit, StandsABodyThatIsTurned) {
+  for (const double angle : {0.1, -0.5}) {
+    SCOPED_TRACE(angle);
+    Person person = synthetic::person();
+    const Eigen::Matrix3d turn = Eigen::AngleAxisd(angle, Vector3d::UnitY()).toRotationMatrix();
+    for (auto& capsule : person.body) {
+      capsule.from = turn * capsule.from;
+      capsule.to = turn * capsule.to;
+    }
+    for (auto& [name, p] : person.joints) p = turn * p;
+    expect_person(person, 0.04);
   }
-  for (auto& [name, p] : person.joints) p = turn * p;
-  expect_person(person, 0.04);
+}
+
+TEST(SkeletonFit, HandsOnTheHipsLeaveTheElbowsToFollow) {
+  Person person = synthetic::person();
+  std::erase_if(person.body, [](const synthetic::Capsule& c) { return std::abs(c.from.x()) > 0.18; });
+  for (const double side : {1.0, -1.0}) {
+    const Vector3d shoulder(side * 0.189, 1.374, 0), elbow(side * 0.40, 1.17, -0.06), hand(side * 0.16, 0.97, 0.02);
+    person.body.push_back({shoulder, elbow, 0.05, 0.04});
+    person.body.push_back({elbow, hand, 0.04, 0.03});
+    for (auto& [name, p] : person.joints)
+      if (name == (side > 0 ? "LeftForeArm" : "RightForeArm")) p = elbow;
+  }
+  std::erase_if(person.joints, [](const auto& joint) { return joint.first.find("Hand") != std::string::npos; });
+  const Mesh mesh = surface_of(person.body);
+  const Fitted fit = fitted(mesh);
+  expect_joints_near(fit, person, 0.045);
+  expect_inside(fit, mesh);
+  EXPECT_THAT(fit.warnings, testing::Contains(testing::HasSubstr("left hand cannot be told")));
 }
 
 TEST(SkeletonFit, IgnoresCrumbsBesideTheBody) {
