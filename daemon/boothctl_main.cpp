@@ -295,7 +295,7 @@ void Operator::fetch(const std::string& avatar, std::vector<std::string> files, 
   if (files.empty()) {
     const Json metadata = call("avatar.get", {{"avatar", avatar}}).result;
     files.emplace_back("metadata.json");
-    for (const auto& [name, file] : metadata.value("files", Json::object()).items()) files.push_back(name);
+    for (const auto& [name, file] : metadata.at("files").items()) files.push_back(name);
   }
   std::error_code code;
   fs::create_directories(folder, code);
