@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <numeric>
+#include <functional>
 
 #include "pipeline/segmentation/components.h"
 #include "pipeline/segmentation/minimum_cut.h"
@@ -298,19 +298,19 @@ CellMask cut(const std::vector<float>& evidence, const Residual& residual, const
 }
 
 /// Parts that are tiny beside the largest are specks: noise, insects, a reflection.
-int remove_specks(CellMask& mask, const CellGrid& grid, double smallest_part) {
+/// @return the second largest part's share of the largest
+double remove_specks(CellMask& mask, const CellGrid& grid, double smallest_part) {
   const Components parts = connected_components(mask, grid.width, grid.height, 1, 1, Connectivity::eight);
   if (parts.areas.empty()) return 0;
-  const size_t largest = *std::max_element(parts.areas.begin(), parts.areas.end());
-  const auto smallest = static_cast<size_t>(smallest_part * static_cast<double>(largest));
-  int kept = 0;
-  for (const size_t area : parts.areas) kept += area >= smallest;
+  std::vector<size_t> areas = parts.areas;
+  std::sort(areas.begin(), areas.end(), std::greater<>());
+  const auto largest = static_cast<double>(areas[0]);
   for (const Components::Run& run : parts.runs) {
-    if (parts.areas[run.part] >= smallest) continue;
+    if (static_cast<double>(parts.areas[run.part]) >= smallest_part * largest) continue;
     std::fill(mask.begin() + static_cast<long>(grid.index(run.begin, run.row)),
               mask.begin() + static_cast<long>(grid.index(run.end, run.row)), uint8_t{0});
   }
-  return kept;
+  return areas.size() > 1 ? static_cast<double>(areas[1]) / largest : 0;
 }
 
 /// A hole through which one sees the background has a rim that shows as an edge. One without is a piece of the
@@ -367,7 +367,7 @@ Labeling label_cells(const CellGrid& grid, const Residual& residual, const Label
 
   Labeling labeling;
   labeling.subject = cut(evidence, residual, grid, options.smoothness);
-  labeling.parts = remove_specks(labeling.subject, grid, options.smallest_part);
+  labeling.second_part = remove_specks(labeling.subject, grid, options.smallest_part);
   fill_false_holes(labeling.subject, grid, evidence, residual);
   std::vector<float> of_subject;
   for (size_t i = 0; i < evidence.size(); ++i) {

@@ -15,7 +15,8 @@ namespace booth::segmentation {
 /// the empty booth under the drift and shadow seen just outside, and the subject's F, seen just inside: coverage is
 /// the projection of I − B on F − B. It is taken in linear light, where a lens and a sensor mix what a pixel covers;
 /// in sRGB the outline of a dark subject before a bright wall would move outwards by a quarter of its blur.
-/// Where F and B hardly differ the labels' own outline, smoothed, takes over.
+/// Where F and B hardly differ the outline known before takes over; pixels of a colour that neither has, such as
+/// highlights along the rim, are subject.
 Image matte(std::span<const Frame> background, const Image& body, const CellGrid& grid, const Residual& residual,
             const CellMask& subject);
 

@@ -18,6 +18,7 @@ using segmentation::Residual;
 constexpr double much_border = 0.5;        ///< share of the image's border that the subject touches
 constexpr double much_drift = 1.4;         ///< factor in linear light between the captures
 constexpr double little_agreement = 0.25;  ///< share of the image that still looks like the background
+constexpr double large_second_part = 0.2;  ///< see Labeling::second_part
 constexpr double little_contrast = 0.3;    ///< see Labeling::contrast
 
 Result<void> check(const SegmentationOptions& options) {
@@ -104,6 +105,7 @@ std::vector<std::string> find_warnings(const Residual& residual, const Labeling&
   }
   if (residual.drift_support < little_agreement) warn("little of the image still looks like the background");
   if (labeling.contrast < little_contrast) warn("the subject hardly differs from the background");
+  if (labeling.second_part > large_second_part) warn("something else than the subject seems to be in view");
   if (border_share(result.silhouette.coverage) > much_border)
     warn("the subject reaches over most of the image's border");
   return warnings;

@@ -398,6 +398,14 @@ TEST(Segmentation, WarnsWhenSomethingFillsTheImage) {
   EXPECT_THAT(result->warnings, testing::Contains(HasSubstr("border")));
 }
 
+TEST(Segmentation, WarnsOfASecondPersonAtTheEdge) {
+  Scene scene = figure_scene();
+  scene.subject = [](double x, double y) { return in_figure(x, y) || (x > 170 && y > 60 && y < 200); };
+  const Result<Segmentation> result = run(scene);
+  ASSERT_TRUE(result) << result.error().message;
+  EXPECT_THAT(result->warnings, testing::Contains(HasSubstr("something else")));
+}
+
 TEST(Segmentation, TheSameBytesWhateverTheThreads) {
   const Scene scene = figure_scene();
   const std::vector<Frame> background = scene.empty_booth();
