@@ -1,112 +1,21 @@
 #include "pipeline/hull/visual_hull.h"
 
-#include <Eigen/SVD>
 #include <algorithm>
 #include <cmath>
 #include <limits>
 #include <memory>
 #include <string>
 
-#include "pipeline/geometry/camera_model.h"
-#include "pipeline/hull/outline_distance.h"
+#include "pipeline/hull/contradictions.h"
+#include "pipeline/hull/silhouette_view.h"
 #include "pipeline/hull/solid_parts.h"
 
 namespace booth {
 namespace {
 
 constexpr int side = Field::brick_side;
-constexpr double nearest_m = 0.01;  // points closer to a camera's plane than this are not seen by it
 /// Values are cut off at this many voxels: the zero level needs no more than the ends of the edges that cross it.
 constexpr double cut_off_voxels = 2;
-/// Beside a cut-off silhouette a camera's say fades over this share of its image's shorter side.
-constexpr double feather_share = 0.06;
-/// What distances between the outline's tiles may be off by, and the rounding of projections, in pixels.
-constexpr double distance_slack_px = 1;
-
-/// A camera with its outline, and what bounds need to know about its lens.
-struct View {
-  View(const RigCamera& camera_, const Image& coverage)
-      : camera(&camera_),
-        outline(coverage, feather_share * std::min(coverage.width, coverage.height)),
-        rotation(camera_.camera_from_world.linear().cast<float>()),
-        translation(camera_.camera_from_world.translation().cast<float>()),
-        focal_px(std::sqrt(camera_.intrinsics.fx * camera_.intrinsics.fy)) {
-    measure_lens();
-  }
-
-  const RigCamera* camera;
-  OutlineDistance outline;
-  Eigen::Matrix3f rotation;
-  Eigen::Vector3f translation;
-  double focal_px;
-  double stretch_px = 0;     ///< the most pixels that a step of one in the plane z = 1 moves a projection
-  double image_radius2 = 0;  ///< beyond this squared distance from the axis in the plane z = 1, nothing is imaged
-
- private:
-  /// Samples the image, and a margin around it that balls on its edge reach into.
-  void measure_lens() {
-    const Intrinsics& k = camera->intrinsics;
-    constexpr int steps = 16;
-    constexpr double margin = 0.1;
-    for (int i = 0; i <= steps; ++i)
-      for (int j = 0; j <= steps; ++j) {
-        const Eigen::Vector2d share(static_cast<double>(i) / steps, static_cast<double>(j) / steps);
-        const Eigen::Vector2d size(k.width, k.height);
-        const Eigen::Vector2d wide = (share * (1 + 2 * margin) - Eigen::Vector2d::Constant(margin)).cwiseProduct(size);
-        const Eigen::Vector3d direction = unproject(k, wide);
-        constexpr double step = 1e-4;
-        const auto middle = project_camera_point(k, direction);
-        const auto beside = project_camera_point(k, direction + Eigen::Vector3d(step, 0, 0));
-        const auto below = project_camera_point(k, direction + Eigen::Vector3d(0, step, 0));
-        if (middle && beside && below) {
-          Eigen::Matrix2d jacobian;
-          jacobian.col(0) = (*beside - *middle) / step;
-          jacobian.col(1) = (*below - *middle) / step;
-          stretch_px = std::max(stretch_px, jacobian.jacobiSvd().singularValues()[0]);
-        }
-        image_radius2 = std::max(image_radius2, unproject(k, share.cwiseProduct(size)).head<2>().squaredNorm());
-      }
-    constexpr double between_samples = 1.02;
-    stretch_px *= between_samples;
-    image_radius2 *= between_samples;
-  }
-};
-
-/// What a camera can say about all points of a ball.
-struct Verdict {
-  bool seen = false;               ///< the whole ball is inside the image
-  bool hidden = false;             ///< no point of it is
-  double least_m = 0, most_m = 0;  ///< bounds of the distance at points that are seen
-};
-
-Verdict judge(const View& view, const Eigen::Vector3d& center, double radius_m) {
-  constexpr double unbounded = std::numeric_limits<double>::infinity();
-  const Eigen::Vector3d p = view.camera->camera_from_world * center;
-  if (p.z() + radius_m < nearest_m) return {.hidden = true};
-  if (p.z() - radius_m < nearest_m) return {.least_m = -unbounded, .most_m = unbounded};
-  const double off_axis = p.head<2>().norm() / p.z();
-  // From q to p, both in the ball, a projection moves by |(q − p)xy − x (q − p)z| / qz in the plane z = 1.
-  const double moved = radius_m * std::sqrt(1 + off_axis * off_axis) / (p.z() - radius_m);
-  if (off_axis > moved && (off_axis - moved) * (off_axis - moved) > view.image_radius2) return {.hidden = true};
-  const auto pixel = project_camera_point(view.camera->intrinsics, p);
-  if (!pixel) return {.least_m = -unbounded, .most_m = unbounded};
-  const double moved_px = moved * view.stretch_px + distance_slack_px;
-  const double right = view.camera->intrinsics.width - 0.5, bottom = view.camera->intrinsics.height - 0.5;
-  // How far inside the image the middle is; negative outside.
-  const double within = std::min({pixel->x() + 0.5, right - pixel->x(), pixel->y() + 0.5, bottom - pixel->y()});
-  Verdict verdict;
-  verdict.seen = within >= moved_px;
-  verdict.hidden = within < -moved_px;
-  if (verdict.hidden) return verdict;
-  // The distance is looked up at the image's nearest point; seen points are no farther from it than twice the move.
-  const double reach_px = view.outline.slope() * moved_px * (within < 0 ? 2 : 1);
-  const double middle_px = view.outline.at(static_cast<float>(pixel->x()), static_cast<float>(pixel->y()));
-  const auto metres = [&](double px) { return px * (p.z() + (px < 0 ? -radius_m : radius_m)) / view.focal_px; };
-  const auto metres_low = [&](double px) { return px * (p.z() + (px < 0 ? radius_m : -radius_m)) / view.focal_px; };
-  verdict.least_m = metres_low(middle_px - reach_px);
-  verdict.most_m = metres(middle_px + reach_px);
-  return verdict;
-}
 
 /// A cube of bricks, and the cameras whose say about it is still open.
 struct Node {
@@ -120,9 +29,9 @@ enum class Place { outside, inside, open };
 
 class Carving {
  public:
-  Carving(const Rig& rig, std::vector<std::unique_ptr<View>> views, const VisualHullOptions& options, const Work& work)
+  Carving(const Rig& rig, const SilhouetteViews& views, const VisualHullOptions& options, const Work& work)
       : box_(rig.volume),
-        views_(std::move(views)),
+        views_(views),
         min_views_(options.min_views),
         cut_off_m_(static_cast<float>(cut_off_voxels * options.voxel_m)),
         work_(work) {
@@ -197,7 +106,7 @@ class Carving {
     int seen = node.sure_views, perhaps_seen = node.sure_views;
     std::vector<uint32_t> open;
     for (const uint32_t v : node.open) {
-      const Verdict verdict = judge(*views_[v], center, radius_m);
+      const SilhouetteView::Verdict verdict = views_[v]->judge(center, radius_m);
       if (verdict.hidden) continue;
       if (verdict.seen && verdict.least_m > 0) return Place::outside;
       ++perhaps_seen;
@@ -271,7 +180,7 @@ class Carving {
     const bool count_views = node.sure_views < min_views_;
     std::vector<Samples> within;  // for every open camera, how far inside its image the samples are, metres
     for (const uint32_t v : node.open) {
-      const Verdict verdict = judge(*views_[v], center, half_m * std::sqrt(3.0));
+      const SilhouetteView::Verdict verdict = views_[v]->judge(center, half_m * std::sqrt(3.0));
       if (verdict.seen && verdict.least_m > static_cast<double>(cut_off_m_)) {
         values.fill(cut_off_m_);
         return values;
@@ -292,55 +201,21 @@ class Carving {
     return values;
   }
 
-  void carve(const View& view, const Samples& x, const Samples& y, const Samples& z, Samples& values,
+  void carve(const SilhouetteView& view, const Samples& x, const Samples& y, const Samples& z, Samples& values,
              Samples* within_m) const {
-    Samples u, v, depth;  // pixels, pixels, metres
-    project(view, x, y, z, u, v, depth);
-    const float right = static_cast<float>(view.camera->intrinsics.width) - 0.5F;
-    const float bottom = static_cast<float>(view.camera->intrinsics.height) - 0.5F;
-    const auto per_focal = static_cast<float>(1 / view.focal_px);
+    Samples u, v, depth, within_px;
+    for (size_t s = 0; s < values.size(); ++s) view.project(x[s], y[s], z[s], u[s], v[s], depth[s], within_px[s]);
     for (size_t s = 0; s < values.size(); ++s) {
-      const float pixel_m = depth[s] * per_focal;
-      const float within_px = std::min(std::min(u[s] + 0.5F, right - u[s]), std::min(v[s] + 0.5F, bottom - v[s]));
-      if (within_m != nullptr) (*within_m)[s] = within_px * pixel_m;
-      if (!(within_px >= 0) || values[s] >= cut_off_m_) continue;
-      const float distance_m = view.outline.at(u[s], v[s]) * pixel_m;
+      const float pixel_m = depth[s] * view.per_focal();
+      if (within_m != nullptr) (*within_m)[s] = within_px[s] * pixel_m;
+      if (!(within_px[s] >= 0) || values[s] >= cut_off_m_) continue;
+      const float distance_m = view.outline().at(u[s], v[s]) * pixel_m;
       values[s] = std::clamp(distance_m, values[s], cut_off_m_);
     }
   }
 
-  /// As project_camera_point, in single precision and for many points; what is not imaged lands far outside.
-  static void project(const View& view, const Samples& x, const Samples& y, const Samples& z, Samples& u, Samples& v,
-                      Samples& depth) {
-    const Intrinsics& k = view.camera->intrinsics;
-    const Eigen::Matrix3f& r = view.rotation;
-    const Eigen::Vector3f& t = view.translation;
-    const auto k1 = static_cast<float>(k.distortion[0]), k2 = static_cast<float>(k.distortion[1]);
-    const auto p1 = static_cast<float>(k.distortion[2]), p2 = static_cast<float>(k.distortion[3]);
-    const auto k3 = static_cast<float>(k.distortion[4]);
-    const auto fx = static_cast<float>(k.fx), fy = static_cast<float>(k.fy), skew = static_cast<float>(k.skew);
-    const auto cx = static_cast<float>(k.cx), cy = static_cast<float>(k.cy);
-    const auto radius2 = static_cast<float>(view.image_radius2);
-    constexpr auto near = static_cast<float>(nearest_m);
-    constexpr float nowhere = -1e6F;
-    for (size_t s = 0; s < x.size(); ++s) {
-      const float camera_z = r(2, 0) * x[s] + r(2, 1) * y[s] + r(2, 2) * z[s] + t[2];
-      const float d = camera_z > near ? camera_z : near;
-      const float a = (r(0, 0) * x[s] + r(0, 1) * y[s] + r(0, 2) * z[s] + t[0]) / d;
-      const float b = (r(1, 0) * x[s] + r(1, 1) * y[s] + r(1, 2) * z[s] + t[1]) / d;
-      const float r2 = a * a + b * b;
-      const float radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3));
-      const float da = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a);
-      const float db = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b;
-      const bool imaged = camera_z > near && r2 < radius2;
-      u[s] = imaged ? fx * da + skew * db + cx : nowhere;
-      v[s] = imaged ? fy * db + cy : nowhere;
-      depth[s] = d;
-    }
-  }
-
   Eigen::AlignedBox3d box_;
-  std::vector<std::unique_ptr<View>> views_;
+  const SilhouetteViews& views_;
   int min_views_;
   float cut_off_m_;
   const Work& work_;
@@ -354,6 +229,12 @@ Result<void> check_input(const Rig& rig, std::span<const Silhouette> silhouettes
   if (options.min_views < 1)
     return Error{ErrorCode::invalid_argument,
                  "hull: min_views is " + std::to_string(options.min_views) + ", expected at least 1"};
+  constexpr double most_bricks = 1 << 25;
+  const Eigen::Vector3d bricks = rig.volume.sizes() / (options.voxel_m * side) + Eigen::Vector3d::Constant(2);
+  if (rig.volume.isEmpty() || !(bricks.prod() <= most_bricks))
+    return Error{ErrorCode::invalid_argument, "hull: the rig's volume of " + std::to_string(rig.volume.volume()) +
+                                                  " m³ is empty, or too large for a voxel_m of " +
+                                                  std::to_string(options.voxel_m)};
   for (size_t i = 0; i < silhouettes.size(); ++i) {
     const Silhouette& silhouette = silhouettes[i];
     const RigCamera* camera = rig.find(silhouette.camera);
@@ -373,42 +254,59 @@ Result<void> check_input(const Rig& rig, std::span<const Silhouette> silhouettes
   return {};
 }
 
+SilhouetteViews make_views(const Rig& rig, std::span<const Silhouette> silhouettes, const Work& work) {
+  SilhouetteViews views(silhouettes.size());
+  work.parallel_for(silhouettes.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; ++i)
+      if (const RigCamera* camera = rig.find(silhouettes[i].camera))
+        views[i] = std::make_unique<SilhouetteView>(*camera, silhouettes[i].coverage);
+  });
+  std::erase(views, nullptr);
+  return views;
+}
+
 }  // namespace
 
 Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette> silhouettes,
                                      const VisualHullOptions& options, const Work& work) {
   if (auto fine = check_input(rig, silhouettes, options); !fine) return fine.error();
 
-  std::vector<std::unique_ptr<View>> made(silhouettes.size());
-  work.parallel_for(silhouettes.size(), 1, [&](size_t begin, size_t end) {
-    for (size_t i = begin; i < end; ++i)
-      if (const RigCamera* camera = rig.find(silhouettes[i].camera))
-        made[i] = std::make_unique<View>(*camera, silhouettes[i].coverage);
-  });
+  SilhouetteViews views = make_views(rig, silhouettes, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.3);
 
   VisualHull hull;
-  std::vector<std::unique_ptr<View>> views;
-  for (auto& view : made) {
-    if (!view) continue;
-    if (view->outline.content() == OutlineDistance::Content::no_subject) {
-      hull.warnings.push_back("camera " + view->camera->id + " sees no subject; the hull was made without it");
-      continue;
-    }
-    hull.cameras.push_back(view->camera->id);
-    views.push_back(std::move(view));
-  }
+  std::erase_if(views, [&](const std::unique_ptr<SilhouetteView>& view) {
+    const bool blind = view->outline().content() == OutlineDistance::Content::no_subject;
+    const std::string& id = view->camera().id;
+    if (blind) hull.warnings.push_back("camera " + id + " sees no subject; the hull was made without it");
+    if (!blind) hull.cameras.push_back(id);
+    return blind;
+  });
   if (views.empty() && !hull.warnings.empty()) return Error{ErrorCode::no_subject, "no camera sees a subject"};
   if (static_cast<int>(views.size()) < options.min_views)
     return Error{ErrorCode::too_few_views, "only " + std::to_string(views.size()) + " cameras have a silhouette, " +
                                                std::to_string(options.min_views) + " are needed"};
 
-  hull.field = Carving(rig, std::move(views), options, work).run();
+  SolidParts parts;
+  const auto carve = [&] {
+    hull.field = Carving(rig, views, options, work).run();
+    if (!work.stopped()) parts = keep_largest_part(hull.field, work);
+  };
+  carve();
+  work.report(0.7);
+  // A camera that alone denies what all others see is overruled there; then the hull is carved anew.
+  const std::vector<Contradiction> contradictions = find_contradictions(rig.volume, views, hull.field, work);
+  if (!contradictions.empty() && !work.stopped()) {
+    for (const Contradiction& contradiction : contradictions) {
+      auto& view = views[contradiction.view];
+      hull.warnings.push_back("the silhouette of camera " + view->camera().id +
+                              " lacks a part of the subject that the other cameras see; it was overruled there");
+      view = std::make_unique<SilhouetteView>(view->camera(), overrule(view->coverage(), contradiction));
+    }
+    carve();
+  }
   if (work.stopped()) return Work::cancelled();
-  work.report(0.8);
-
-  const SolidParts parts = keep_largest_part(hull.field, work);
   if (parts.kept_samples == 0)
     return Error{ErrorCode::no_subject, "no point of the capture volume is inside all silhouettes"};
   work.report(1);

@@ -25,7 +25,8 @@ struct VisualHull {
 /// The largest solid that fits inside every silhouette and inside rig.volume: one connected body without cavities.
 ///
 /// A camera has a say only about points inside its image; where its silhouette is cut off by the image's border, its
-/// say fades towards the cut. Silhouettes without any subject are left out, with a warning.
+/// say fades towards the cut. Silhouettes without any subject are left out; where a camera alone denies what all
+/// others see, it is overruled (see contradictions.h). Both with a warning that names the camera.
 ///
 /// @param rig          world frame; only cameras that have a silhouette are used
 /// @param silhouettes  at most one a camera, distorted pixels, as captured; the size of the camera's image
@@ -33,7 +34,8 @@ struct VisualHull {
 ///         curvature over one voxel, not by half a voxel as with binary voxels
 /// @error no_subject        nothing is left after carving
 /// @error too_few_views     fewer than options.min_views silhouettes of cameras in the rig
-/// @error invalid_argument  options out of range, two silhouettes of one camera, or a silhouette of another size
+/// @error invalid_argument  options out of range, a volume that is empty or too large for the voxel, two
+///                          silhouettes of one camera, or a silhouette of another size than its camera's image
 /// Cost: grows with the surface (bricks that surely lie inside or outside are settled by one look per camera) and with
 /// the length of the outlines. Same input, same bytes, whatever the thread count.
 /// Source: A. Laurentini, "The visual hull concept for silhouette-based image understanding", IEEE PAMI 16(2), 1994;

@@ -256,6 +256,53 @@ TEST(VisualHull, ACameraThatSeesNobodyIsNamedAndLeftOut) {
   EXPECT_LT(deepest_cut_m(extract_surface(hull->field), scene.body), 0.005);
 }
 
+/// Blanks a square of a silhouette around a point of the world.
+void blank_around(const Rig& rig, Silhouette& silhouette, const Eigen::Vector3d& p_world, int reach_px) {
+  const Eigen::Vector2d middle = project(*rig.find(silhouette.camera), p_world).value();
+  const int x = static_cast<int>(std::lround(middle.x())), y = static_cast<int>(std::lround(middle.y()));
+  for (int dy = -reach_px; dy <= reach_px; ++dy)
+    for (int dx = -reach_px; dx <= reach_px; ++dx)
+      if (silhouette.coverage.contains(x + dx, y + dy)) silhouette.coverage.at(x + dx, y + dy) = 0;
+}
+
+TEST(VisualHull, OneSilhouetteWithoutAForearmIsOverruledAndNamed) {
+  const auto joints = synthetic::person().joints;
+  const auto hand = std::find_if(joints.begin(), joints.end(), [](const auto& j) { return j.first == "LeftHand"; });
+  ASSERT_NE(hand, joints.end());
+  Scene scene = person_scene();
+  const double whole = volume_m3(hull_mesh(scene));
+  blank_around(scene.rig, scene.silhouettes[0], hand->second, 9);
+  const auto hull = carve_visual_hull(scene.rig, scene.silhouettes, {.voxel_m = 0.01});
+  ASSERT_TRUE(hull.ok());
+  ASSERT_EQ(hull->warnings.size(), 1U);
+  EXPECT_THAT(hull->warnings[0], HasSubstr(scene.silhouettes[0].camera));
+  const Mesh mesh = extract_surface(hull->field);
+  EXPECT_LT(deepest_cut_m(mesh, scene.body), 0.004);
+  EXPECT_LT(volume_m3(mesh), 1.03 * whole);
+}
+
+TEST(VisualHull, AHoleInOneSilhouetteMakesNoTunnel) {
+  Scene scene = person_scene();
+  for (const int reach_px : {0, 2}) {
+    SCOPED_TRACE(reach_px);
+    scene.silhouettes = person_scene().silhouettes;
+    blank_around(scene.rig, scene.silhouettes[3], {0, 1.15, 0}, reach_px);
+    const auto hull = carve_visual_hull(scene.rig, scene.silhouettes, {.voxel_m = 0.01});
+    ASSERT_TRUE(hull.ok());
+    EXPECT_LT(deepest_cut_m(extract_surface(hull->field), scene.body), 0.004);
+  }
+}
+
+TEST(VisualHull, TrueSilhouettesGiveNoWarning) {
+  Scene scene = person_scene();
+  for (size_t cameras = 8; cameras >= 3; --cameras) {
+    scene.silhouettes.resize(cameras);
+    const auto hull = carve_visual_hull(scene.rig, scene.silhouettes, {.voxel_m = 0.02});
+    ASSERT_TRUE(hull.ok());
+    EXPECT_TRUE(hull->warnings.empty()) << cameras << " cameras: " << hull->warnings[0];
+  }
+}
+
 TEST(VisualHull, RefusesWhatCannotWork) {
   const Scene& scene = person_scene();
   const auto code = [&](const std::vector<Silhouette>& silhouettes, const VisualHullOptions& options) {
@@ -285,6 +332,9 @@ TEST(VisualHull, RefusesWhatCannotWork) {
   EXPECT_EQ(code(scene.silhouettes, {.voxel_m = 0}), ErrorCode::invalid_argument);
   EXPECT_EQ(code(scene.silhouettes, {.voxel_m = std::nan("")}), ErrorCode::invalid_argument);
   EXPECT_EQ(code(scene.silhouettes, {.voxel_m = 0.01, .min_views = 0}), ErrorCode::invalid_argument);
+  Rig boundless = scene.rig;
+  boundless.volume.max().setConstant(1e9);
+  EXPECT_EQ(carve_visual_hull(boundless, scene.silhouettes, {}).error().code, ErrorCode::invalid_argument);
   Work stopped;
   std::stop_source source;
   source.request_stop();
