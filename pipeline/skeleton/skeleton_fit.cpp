@@ -767,7 +767,8 @@ Eigen::Isometry3d bone_frame(const Vector3d& at, const Vector3d& along, const Ve
   if (!(along.norm() > 1e-9)) y = Vector3d::UnitY();
   Vector3d reference = ahead;
   constexpr double nearly_parallel = 0.95;
-  if (std::abs(y.dot(reference)) > nearly_parallel) reference = Vector3d::UnitY();
+  if (std::abs(y.dot(reference)) > nearly_parallel)
+    reference = std::abs(ahead.y()) > 0.5 ? Vector3d::UnitZ() : Vector3d::UnitY();
   const Vector3d z = (reference - reference.dot(y) * y).normalized();
   Eigen::Isometry3d frame = Eigen::Isometry3d::Identity();
   frame.linear().col(0) = y.cross(z);
