@@ -130,9 +130,9 @@ def check_events(events):
 
 def main(bin_dir, recording, check_avatar):
     with tempfile.TemporaryDirectory(prefix="booth-e2e-") as state:
-        booth = Booth(bin_dir, state, recording)
-        booth.start()
+        booth = Booth(bin_dir, state, pathlib.Path(recording).resolve())
         try:
+            booth.start()
             told = booth.call("system.describe")
             assert told["api"] == 1 and "capture.start" in told["methods"], told
 
@@ -170,12 +170,13 @@ def main(bin_dir, recording, check_avatar):
 
             for avatar in avatars:
                 booth.call("avatar.delete", avatar=avatar["id"])
+                booth.events_until("avatar.deleted", REPLY_WITHIN_S)
             assert booth.call("avatar.list")["avatars"] == []
             left = [p for name in ("recordings", "jobs", "avatars") for p in (booth.state / "state" / name).rglob("*")]
             assert not left, f"traces are left: {left}"
             assert booth.stop() == 0
         finally:
-            if booth.process.poll() is None:
+            if booth.process and booth.process.poll() is None:
                 booth.process.kill()
     print("passed")
 
