@@ -83,7 +83,7 @@ class Blender {
     constexpr float least_confidence = 0.03F;
     const float base = o.rating * trust.visible * (least_confidence + (1 - least_confidence) * trust.confidence);
     const float square = base * base;
-    return square * square;
+    return base * square;
   }
 
   std::span<const PreparedView> views_;

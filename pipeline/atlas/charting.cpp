@@ -28,8 +28,8 @@ std::vector<Chart> cut_into_charts(const Mesh& mesh, Charting charting, double c
   unfolding.clearance_m = clearance_m;
   if (charting == Charting::unfolding) return unfold(mesh, {}, unfolding);
 
-  // Enough regions that gaps between large charts find small ones to fill them; not fewer triangles than make a disc.
-  constexpr int most_regions = 200;
+  // Few and large, for short seams; curvature adds more. Not fewer triangles than make a disc.
+  constexpr int most_regions = 50;
   constexpr size_t triangles_a_region = 24;
   const int regions = static_cast<int>(std::clamp<size_t>(mesh.triangles.size() / triangles_a_region, 1, most_regions));
   const auto neighbours = triangle_neighbours(mesh);

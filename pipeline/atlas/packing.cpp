@@ -5,18 +5,22 @@
 #include <bit>
 #include <cmath>
 #include <cstdint>
+#include <deque>
 #include <limits>
 #include <numbers>
 #include <numeric>
 #include <optional>
+#include <queue>
+#include <tuple>
+#include <utility>
+
+#include "pipeline/atlas/planar_grid.h"
 
 namespace booth {
 namespace {
 
 /// Charts are placed on a lattice of blocks of this many texels a side: coarser packs faster, finer packs tighter.
 constexpr int block_texels = 2;
-
-using Corners = std::array<Eigen::Vector2d, 3>;
 
 /// Which blocks a chart covers, row by row as runs of neighbouring blocks.
 struct Run {
@@ -31,21 +35,38 @@ struct Footprint {
 /// A chart with y downwards, turned so that its bounding box is the smallest, its lowest corner at the origin;
 /// metres × density.
 struct Piece {
-  std::vector<Corners> corners;
+  std::vector<uint32_t> triangles;
+  std::vector<FlatCorners> corners;
   Eigen::Vector2d extent = Eigen::Vector2d::Zero();
   double area = 0;
 };
+
+/// Moves the piece's lowest corner to the origin and measures it.
+void settle(Piece& piece) {
+  Eigen::Vector2d low = Eigen::Vector2d::Constant(std::numeric_limits<double>::infinity()), high = -low;
+  for (const FlatCorners& triangle : piece.corners)
+    for (const Eigen::Vector2d& p : triangle) {
+      low = low.cwiseMin(p);
+      high = high.cwiseMax(p);
+    }
+  piece.extent = high - low;
+  piece.area = 0;
+  for (FlatCorners& triangle : piece.corners) {
+    for (Eigen::Vector2d& p : triangle) p -= low;
+    const Eigen::Vector2d ab = triangle[1] - triangle[0], ac = triangle[2] - triangle[0];
+    piece.area += 0.5 * std::abs(ab.x() * ac.y() - ab.y() * ac.x());
+  }
+}
 
 Piece turned_to_smallest_box(const Chart& chart, double density) {
   constexpr int steps = 45;  // of a quarter turn
   double best_area = std::numeric_limits<double>::infinity();
   Eigen::Matrix2d best = Eigen::Matrix2d::Identity();
-  Eigen::Vector2d best_low = Eigen::Vector2d::Zero(), best_extent = best_low;
   for (int step = 0; step < steps; ++step) {
     const Eigen::Matrix2d turn =
         Eigen::Rotation2Dd(0.5 * std::numbers::pi * step / steps) * Eigen::Vector2d(1, -1).asDiagonal();
     Eigen::Vector2d low = Eigen::Vector2d::Constant(std::numeric_limits<double>::infinity()), high = -low;
-    for (const Corners& triangle : chart.corners)
+    for (const FlatCorners& triangle : chart.corners)
       for (const Eigen::Vector2d& p : triangle) {
         const Eigen::Vector2d q = turn * p;
         low = low.cwiseMin(q);
@@ -54,18 +75,14 @@ Piece turned_to_smallest_box(const Chart& chart, double density) {
     if (const double area = (high - low).prod(); area < best_area) {
       best_area = area;
       best = turn;
-      best_low = low;
-      best_extent = high - low;
     }
   }
-  Piece piece;
-  piece.extent = density * best_extent;
-  for (const Corners& triangle : chart.corners) {
-    Corners& placed = piece.corners.emplace_back();
-    for (size_t k = 0; k < 3; ++k) placed[k] = density * (best * triangle[k] - best_low);
-    const Eigen::Vector2d ab = placed[1] - placed[0], ac = placed[2] - placed[0];
-    piece.area += 0.5 * std::abs(ab.x() * ac.y() - ab.y() * ac.x());
+  Piece piece{chart.triangles, {}, Eigen::Vector2d::Zero(), 0};
+  for (const FlatCorners& triangle : chart.corners) {
+    FlatCorners& turned = piece.corners.emplace_back();
+    for (size_t k = 0; k < 3; ++k) turned[k] = density * (best * triangle[k]);
   }
+  settle(piece);
   return piece;
 }
 
@@ -82,8 +99,8 @@ Footprint footprint_of(const Piece& piece, double texels_per_m, int gutter_texel
   footprint.width = blocks(piece.extent.x());
   footprint.height = blocks(piece.extent.y());
   std::vector<uint8_t> covered(static_cast<size_t>(footprint.width) * static_cast<size_t>(footprint.height), 0);
-  for (const Corners& triangle : piece.corners) {
-    Corners p;
+  for (const FlatCorners& triangle : piece.corners) {
+    FlatCorners p;
     for (size_t k = 0; k < 3; ++k)
       p[k] = (texels_per_m * triangle[k] + Eigen::Vector2d::Constant(margin)) / block_texels;
     const double grow = margin / block_texels;
@@ -263,52 +280,92 @@ struct Placement {
   int width = 0, height = 0;  ///< of the footprint before turning, blocks
 };
 
-/// A packing into a strip as wide as the atlas.
-struct Strip {
-  std::vector<Placement> placements;  ///< fewer than pieces where the strip was too short
-  int height = 0;                     ///< blocks
+/// The piece's two halves, cut across its longer side.
+std::array<Piece, 2> halves(const Piece& piece) {
+  const Eigen::Index axis = piece.extent.x() >= piece.extent.y() ? 0 : 1;
+  std::vector<double> middles;
+  for (const FlatCorners& c : piece.corners) middles.push_back(c[0][axis] + c[1][axis] + c[2][axis]);
+  auto sorted = middles;
+  const auto median = sorted.begin() + static_cast<std::ptrdiff_t>(sorted.size() / 2);
+  std::nth_element(sorted.begin(), median, sorted.end());
+  std::array<Piece, 2> parts;
+  for (size_t i = 0; i < middles.size(); ++i) {
+    Piece& part = parts[middles[i] < *median ? 0 : 1];
+    part.triangles.push_back(piece.triangles[i]);
+    part.corners.push_back(piece.corners[i]);
+  }
+  for (Piece& part : parts) settle(part);
+  return parts;
+}
+
+struct Placed {
+  Piece piece;
+  Placement placement;
 };
 
-/// Places the pieces in their order, largest first.
-Strip pack_strip(std::span<const Piece> pieces, double texels_per_m, int width, int most_height, int gutter_texels,
-                 const Work& work) {
-  std::vector<std::array<Footprint, 4>> footprints(pieces.size());
+/// Places the pieces, largest first, in a square bin. A piece that finds no room is halved, and its halves wait for
+/// their turn: so there are small pieces for small gaps when the large gaps are used up.
+///
+/// @return nothing where it does not work out at this scale
+std::optional<std::vector<Placed>> place_all(const std::vector<Piece>& pieces, double texels_per_m, int side,
+                                             int gutter_texels, const Work& work) {
+  // A piece and its footprint in four turns.
+  struct Waiting {
+    const Piece* piece;
+    std::array<Footprint, 4> turns;
+  };
+  const auto prepared = [&](const Piece& piece) {
+    Waiting waiting{&piece, {}};
+    waiting.turns[0] = footprint_of(piece, texels_per_m, gutter_texels);
+    for (size_t turn = 1; turn < 4; ++turn) waiting.turns[turn] = quarter_turned(waiting.turns[turn - 1]);
+    return waiting;
+  };
+  std::vector<Waiting> waiting(pieces.size());
   constexpr size_t grain = 16;
   work.parallel_for(pieces.size(), grain, [&](size_t begin, size_t end) {
-    for (size_t i = begin; i < end; ++i) {
-      footprints[i][0] = footprint_of(pieces[i], texels_per_m, gutter_texels);
-      for (size_t turn = 1; turn < 4; ++turn) footprints[i][turn] = quarter_turned(footprints[i][turn - 1]);
-    }
+    for (size_t i = begin; i < end; ++i) waiting[i] = prepared(pieces[i]);
   });
-  Bin bin(width, most_height);
-  Strip strip;
-  // Where one piece found no room, the next, hardly smaller one will hardly find any: it starts where the last one
-  // came to lie. From time to time the search starts again below, where by now smaller gaps will do.
-  constexpr double restart_at_share = 0.8;
-  double class_size = std::numeric_limits<double>::infinity();
-  int first = 0;
-  for (const auto& turns : footprints) {
-    const double piece_size = std::sqrt(static_cast<double>(turns[0].width) * turns[0].height);
-    if (piece_size < restart_at_share * class_size) {
-      class_size = piece_size;
-      first = 0;
-    }
+  // Not even an ideal packing would be this tight.
+  constexpr double tightest = 0.93;
+  double blocks = 0;
+  for (const Waiting& one : waiting)
+    for (const Run& run : one.turns[0].runs) blocks += run.length();
+  if (blocks > tightest * side * side) return std::nullopt;
+
+  std::deque<Piece> parts;  // of halved pieces
+  // Largest first; of equal ones the first that came.
+  std::priority_queue<std::tuple<double, int64_t>> queue;
+  for (size_t i = 0; i < waiting.size(); ++i) queue.emplace(pieces[i].extent.prod(), -static_cast<int64_t>(i));
+
+  const size_t most_pieces = 2 * pieces.size() + 16;
+  Bin bin(side, side);
+  std::vector<Placed> done;
+  while (!queue.empty()) {
+    const auto i = static_cast<size_t>(-std::get<1>(queue.top()));
+    queue.pop();
     std::optional<Placement> best;
-    int best_top = most_height;
+    int best_top = side;
     for (int turn = 0; turn < 4; ++turn) {
-      const Footprint& footprint = turns[static_cast<size_t>(turn)];
-      const auto place = bin.find(footprint, first, best ? best_top - 1 : best_top);
+      const Footprint& footprint = waiting[i].turns[static_cast<size_t>(turn)];
+      const auto place = bin.find(footprint, 0, best ? best_top - 1 : best_top);
       if (!place) continue;
       best_top = place->y + footprint.height;
-      best = Placement{turn, *place, turns[0].width, turns[0].height};
+      best = Placement{turn, *place, waiting[i].turns[0].width, waiting[i].turns[0].height};
     }
-    if (!best) break;
-    bin.occupy(turns[static_cast<size_t>(best->quarter_turns)], best->place);
-    first = std::max(first, best->place.y - std::max(turns[0].width, turns[0].height) / 2);
-    strip.height = std::max(strip.height, best_top);
-    strip.placements.push_back(*best);
+    if (best) {
+      bin.occupy(waiting[i].turns[static_cast<size_t>(best->quarter_turns)], best->place);
+      done.push_back({*waiting[i].piece, *best});
+      continue;
+    }
+    if (waiting[i].piece->triangles.size() < 2 || waiting.size() + 2 > most_pieces) return std::nullopt;
+    for (Piece& part : halves(*waiting[i].piece)) {
+      if (part.triangles.empty()) return std::nullopt;
+      parts.push_back(std::move(part));
+      queue.emplace(parts.back().extent.prod(), -static_cast<int64_t>(waiting.size()));
+      waiting.push_back(prepared(parts.back()));
+    }
   }
-  return strip;
+  return done;
 }
 
 /// A piece's point, in texels of the atlas.
@@ -332,43 +389,26 @@ Packing pack_charts(std::span<const Chart> charts, size_t triangles, std::span<c
   work.parallel_for(charts.size(), grain, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end; ++i) pieces[i] = turned_to_smallest_box(charts[i], density[i]);
   });
-  std::vector<size_t> order(charts.size());
-  std::iota(order.begin(), order.end(), size_t{0});
-  std::stable_sort(order.begin(), order.end(),
-                   [&](size_t l, size_t r) { return pieces[l].extent.prod() > pieces[r].extent.prod(); });
-  std::vector<Piece> sorted;
-  for (const size_t i : order) sorted.push_back(pieces[i]);
   const double area = std::accumulate(pieces.begin(), pieces.end(), 0.0,
                                       [](double sum, const Piece& piece) { return sum + piece.area; });
 
-  // How tall the strip becomes at one scale tells the next one to try; the best that fits the square is kept.
+  // The largest scale that fits is found by trying smaller and smaller ones, by the share of the atlas they use.
   const int side = size / block_texels;
   const double full = area > 0 ? size / std::sqrt(area) : 1;
-  constexpr double first_share = 0.75, shrink = 0.985, tiny = 1e-6;
-  constexpr int attempts = 4;
-  double share = first_share, best_share = 0;
-  std::vector<Placement> best;
-  for (int attempt = 0; share > tiny && (attempt < attempts || best.empty()); ++attempt) {
-    Strip strip = pack_strip(sorted, full * std::sqrt(share), side, 2 * side, gutter_texels, work);
-    const bool complete = strip.placements.size() == sorted.size();
-    if (complete && strip.height <= side && share > best_share) {
-      best_share = share;
-      best = std::move(strip.placements);
-    }
-    const double fitting = complete ? share * side / std::max(1, strip.height) : 0.5 * share;
-    share = best.empty() ? std::min(fitting, shrink * share) : std::max(fitting, best_share / shrink);
-    if (attempt + 1 >= attempts && !best.empty()) break;
-  }
-  const double best_scale = full * std::sqrt(best_share);
-
+  constexpr double first_share = 0.8, least_share = 1e-4;
+  constexpr double shrink = 0.97, shrink_below_half = 0.7;
   Packing packing;
-  packing.texels_per_m = best_scale;
   packing.corners.assign(triangles, {Eigen::Vector2d::Zero(), Eigen::Vector2d::Zero(), Eigen::Vector2d::Zero()});
-  for (size_t i = 0; i < best.size(); ++i) {
-    const Chart& chart = charts[order[i]];
-    for (size_t t = 0; t < chart.triangles.size(); ++t)
-      for (size_t k = 0; k < 3; ++k)
-        packing.corners[chart.triangles[t]][k] = placed(sorted[i].corners[t][k], best[i], best_scale, gutter_texels);
+  for (double share = first_share; share > least_share; share *= share > 0.5 ? shrink : shrink_below_half) {
+    const double scale = full * std::sqrt(share);
+    const auto done = place_all(pieces, scale, side, gutter_texels, work);
+    if (!done) continue;
+    packing.texels_per_m = scale;
+    for (const auto& [piece, placement] : *done)
+      for (size_t t = 0; t < piece.triangles.size(); ++t)
+        for (size_t k = 0; k < 3; ++k)
+          packing.corners[piece.triangles[t]][k] = placed(piece.corners[t][k], placement, scale, gutter_texels);
+    break;
   }
   return packing;
 }

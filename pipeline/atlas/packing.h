@@ -19,7 +19,8 @@ struct Packing {
 };
 
 /// Places all charts in a square atlas without overlap and as large as they fit, each turned to its narrowest
-/// bounding box and by quarter turns, never mirrored.
+/// bounding box and by quarter turns, never mirrored. Charts for which no gap is left are halved: that costs a little
+/// seam and fills the atlas.
 ///
 /// @param triangles      how many the mesh has; the charts hold each of them once
 /// @param density        one value a chart: its scale relative to the others, > 0

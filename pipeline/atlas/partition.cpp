@@ -69,7 +69,7 @@ class Partitioner {
   }
 
   double error(uint32_t t, const Proxy& proxy) const {
-    constexpr double compactness = 0.25;  // one region's radius away counts like a turn by 30°
+    constexpr double compactness = 0.6;  // one region's radius away counts like a turn by 45°
     return (facets_[t].normal - proxy.normal).squaredNorm() +
            compactness * (facets_[t].middle - proxy.middle).squaredNorm() / radius2_;
   }
