@@ -34,6 +34,7 @@ struct Observation {
   size_t view = 0;
   float rating = 0;  ///< as a share of the usual one
   float x = 0, y = 0, depth_m = 0, lod = 0;
+  bool certain = false;  ///< known to be visible and clear of outlines
 };
 
 class Blender {
@@ -76,7 +77,7 @@ class Blender {
     return o.rating;
   }
   float sharpened_weight(const Observation& o, float* seen_rating) const {
-    const Trust trust = look_up(views_[o.view], o.x, o.y, o.depth_m);
+    const Trust trust = o.certain ? Trust{1, 1} : look_up(views_[o.view], o.x, o.y, o.depth_m);
     if (!(trust.visible > 0)) return 0;
     *seen_rating += o.rating * trust.visible;
     // Near outlines a camera still counts where no other sees the place.
@@ -130,6 +131,27 @@ std::vector<Eigen::Array3f> colour_vertices(const Mesh& mesh, std::span<const Pr
   return colours;
 }
 
+/// Whether the camera sees all of the triangle and its surroundings, far from any outline or depth step: then there
+/// is no need to look at every texel.
+bool certainly_seen(const PreparedView& view, const std::array<uint32_t, 3>& triangle) {
+  Eigen::Array2f low = Eigen::Array2f::Constant(std::numeric_limits<float>::infinity()), high = -low;
+  for (const uint32_t v : triangle) {
+    const Eigen::Vector3f& p = view.projected[v];
+    if (look_up(view, p.x(), p.y(), p.z()).visible < 1) return false;
+    low = low.min(p.head<2>().array());
+    high = high.max(p.head<2>().array());
+  }
+  // In pixels of the confidence map, with one more for interpolation and the band around the triangle.
+  const int x0 = static_cast<int>(std::floor(0.5F * low.x())) - 1, x1 = static_cast<int>(0.5F * high.x()) + 1;
+  const int y0 = static_cast<int>(std::floor(0.5F * low.y())) - 1, y1 = static_cast<int>(0.5F * high.y()) + 1;
+  if (!view.confidence.contains(x0, y0) || !view.confidence.contains(x1, y1)) return false;
+  for (int y = y0; y <= y1; ++y) {
+    const uint8_t* row = view.confidence.pixel(0, y);
+    if (std::any_of(row + x0, row + x1 + 1, [](uint8_t confidence) { return confidence < 255; })) return false;
+  }
+  return true;
+}
+
 /// One triangle, ready to colour its texels.
 class TrianglePainter {
  public:
@@ -159,6 +181,7 @@ class TrianglePainter {
       camera.most = *std::max_element(camera.rating.begin(), camera.rating.end());
       if (!usable || !(camera.most > 0)) continue;
       camera.lod = lod_of((camera.rating[0] + camera.rating[1] + camera.rating[2]) / 3 * usual, texels_per_m2);
+      camera.certain = certainly_seen(views[c], triangle);
       cameras_.push_back(camera);
     }
     if (cameras_.size() > most_cameras) {
@@ -177,7 +200,8 @@ class TrianglePainter {
     for (const Camera& camera : cameras_) {
       const float rating = at(camera.rating), depth = at(camera.depth);
       if (!(rating > 0) || !(depth > 0)) continue;
-      seen[count++] = {camera.view, rating, at(camera.x_depth) / depth, at(camera.y_depth) / depth, depth, camera.lod};
+      seen[count++] = {camera.view, rating,        at(camera.x_depth) / depth, at(camera.y_depth) / depth, depth,
+                       camera.lod,  camera.certain};
     }
     const Evidence evidence = blend(std::span(seen).first(count));
     if (evidence.share >= 1) return evidence.light;
@@ -191,6 +215,7 @@ class TrianglePainter {
     size_t view = 0;
     std::array<float, 3> rating{}, depth{}, x_depth{}, y_depth{};  ///< at the corners
     float most = 0, lod = 0;
+    bool certain = false;
   };
   std::vector<Camera> cameras_;
   std::array<Eigen::Array3f, 3> fallback_;

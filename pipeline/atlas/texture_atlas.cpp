@@ -64,13 +64,34 @@ double seen_share(const Mesh& mesh, const CameraRatings& ratings) {
   return total > 0 ? seen / total : 0;
 }
 
+/// More texels for charts that a camera resolves finer than the atlas would, as close-up cameras do the face.
+std::vector<double> chart_densities(const Mesh& mesh, std::span<const Chart> charts, const CameraRatings& ratings,
+                                    double texel_m) {
+  constexpr double most = 2;
+  std::vector<double> densities;
+  for (const Chart& chart : charts) {
+    double pixels = 0, area = 0;
+    for (const uint32_t t : chart.triangles) {
+      const double here = triangle_area(mesh, t);
+      area += here;
+      for (const uint32_t v : mesh.triangles[t]) {
+        const auto rating = ratings.vertex(v);
+        pixels += here / 3 * static_cast<double>(*std::max_element(rating.begin(), rating.end()));
+      }
+    }
+    const double pixels_a_texel = area > 0 ? std::sqrt(pixels / area) * texel_m : 1;
+    densities.push_back(std::clamp(pixels_a_texel, 1.0, most));
+  }
+  return densities;
+}
+
 /// Charts of the whole surface, placed in the atlas.
-Packing lay_out(const Mesh& mesh, const AtlasOptions& options, const Work& work) {
+Packing lay_out(const Mesh& mesh, const CameraRatings& ratings, const AtlasOptions& options, const Work& work) {
   double area = 0;
   for (size_t t = 0; t < mesh.triangles.size(); ++t) area += triangle_area(mesh, t);
   const double texel_m = std::sqrt(area) / options.size;
   const std::vector<Chart> charts = cut_into_charts(mesh, options.charting, clearance_texels * texel_m, work);
-  const std::vector<double> density(charts.size(), 1.0);
+  const std::vector<double> density = chart_densities(mesh, charts, ratings, texel_m);
   return pack_charts(charts, mesh.triangles.size(), density, options.size, options.gutter_texels, work);
 }
 
@@ -114,7 +135,7 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& mesh, const Rig& rig, std::
   if (work.stopped()) return Work::cancelled();
   work.report(0.4);
 
-  const Packing packing = lay_out(mesh, options, work);
+  const Packing packing = lay_out(mesh, ratings, options, work);
   if (!(packing.texels_per_m > 0))
     return Error{ErrorCode::unsupported,
                  "the surface has too many charts for an atlas of " + std::to_string(options.size) + " texels"};
