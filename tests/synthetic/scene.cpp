@@ -11,20 +11,45 @@
 namespace booth::synthetic {
 namespace {
 
-/// Calls `at(x, y, rays hit, hits)` for every pixel, with a regular pattern of rays in it.
+/// Whether nothing of the body is inside the cone around a ray; may say no where there is nothing.
+bool is_clear(const Body& body, const Eigen::Vector3d& origin, const Eigen::Vector3d& direction,
+              double half_angle_rad) {
+  const Eigen::AlignedBox3d box = bounds(body);
+  const double far = (box.center() - origin).norm() + box.diagonal().norm();
+  for (double along = 0; along < far;) {
+    const double free = signed_distance(body, origin + along * direction) - along * std::tan(half_angle_rad);
+    constexpr double too_little_m = 0.002;
+    if (free < too_little_m) return false;
+    along += free;
+  }
+  return true;
+}
+
+/// Calls `visit(x, y, hits)` for every pixel, with the hits of a regular pattern of rays in it.
 template <class Visitor>
 void for_each_pixel(const Body& body, const RigCamera& camera, int samples, const Visitor& visit) {
   const Eigen::Vector3d origin = camera.center();
+  const Intrinsics& k = camera.intrinsics;
+  constexpr int tile = 8;  // most tiles are empty, which one ray down their middle finds
   std::vector<Eigen::Vector3d> hits;
-  for (int y = 0; y < camera.intrinsics.height; ++y)
-    for (int x = 0; x < camera.intrinsics.width; ++x) {
-      hits.clear();
-      for (int sy = 0; sy < samples; ++sy)
-        for (int sx = 0; sx < samples; ++sx) {
-          const Eigen::Vector2d pixel(x - 0.5 + (sx + 0.5) / samples, y - 0.5 + (sy + 0.5) / samples);
-          if (Eigen::Vector3d hit; trace(body, origin, world_ray(camera, pixel), &hit)) hits.push_back(hit);
+  for (int top = 0; top < k.height; top += tile)
+    for (int left = 0; left < k.width; left += tile) {
+      const Eigen::Vector3d middle = world_ray(camera, {left + 0.5 * (tile - 1), top + 0.5 * (tile - 1)});
+      double half_angle_rad = 0;
+      for (const double x : {left - 0.5, left + tile - 0.5})
+        for (const double y : {top - 0.5, top + tile - 0.5})
+          half_angle_rad = std::max(half_angle_rad, std::acos(std::min(1.0, middle.dot(world_ray(camera, {x, y})))));
+      const bool empty = is_clear(body, origin, middle, half_angle_rad);
+      for (int y = top; y < std::min(top + tile, k.height); ++y)
+        for (int x = left; x < std::min(left + tile, k.width); ++x) {
+          hits.clear();
+          for (int sample = 0; sample < samples * samples && !empty; ++sample) {
+            const Eigen::Vector2d pixel(x - 0.5 + (sample % samples + 0.5) / samples,
+                                        y - 0.5 + (sample / samples + 0.5) / samples);
+            if (Eigen::Vector3d hit; trace(body, origin, world_ray(camera, pixel), &hit)) hits.push_back(hit);
+          }
+          visit(x, y, hits);
         }
-      visit(x, y, hits);
     }
 }
 
