@@ -21,7 +21,7 @@ constexpr double hole_share = 0.004;
 /// The coverage without small holes.
 Image fill_small_holes(const Image& coverage) {
   const double side_px = hole_share * std::min(coverage.width, coverage.height);
-  const auto most_pixels = static_cast<size_t>(side_px * side_px);
+  const size_t most_pixels = std::max(size_t{1}, static_cast<size_t>(side_px * side_px));
   Image filled = coverage;
   const auto subject = [&](int x, int y) { return filled.at(x, y) >= 128; };
   struct Pixel {

@@ -28,8 +28,11 @@ Scene make_scene(const synthetic::Body& body, const synthetic::RigOptions& optio
   return scene;
 }
 
+/// A pixel of person_scene is 16 mm, of which coverage by nine rays leaves up to a third unsure.
+constexpr double unsure_m = 0.006;
+
 const Scene& person_scene() {
-  static const Scene scene = make_scene(synthetic::person().body, {.width = 168, .height = 224});
+  static const Scene scene = make_scene(synthetic::person().body, {.width = 126, .height = 168});
   return scene;
 }
 
@@ -69,8 +72,7 @@ TEST(VisualHull, ContainsTheBodyAndIsOneClosedSolid) {
   const MeshTopology found = topology(mesh);
   EXPECT_TRUE(found.closed_manifold());
   EXPECT_EQ(found.components, 1U);
-  // A pixel is 12 mm here, of which an antialiased outline leaves a few tenths unsure.
-  EXPECT_LT(deepest_cut_m(mesh, scene.body), 0.005);
+  EXPECT_LT(deepest_cut_m(mesh, scene.body), unsure_m);
   const double body_volume = volume_m3(extract_surface(synthetic::sample_field(scene.body, 0.01)));
   EXPECT_GT(found.signed_volume_m3, body_volume);
   EXPECT_LT(found.signed_volume_m3, 1.6 * body_volume);
@@ -126,7 +128,7 @@ TEST(VisualHull, MovesWithTheScene) {
   const Eigen::Isometry3d world_from_moved = moved_from_world.inverse();
   for (size_t v = 0; v < moved.positions.size(); v += 7) {
     const Eigen::Vector3d p = world_from_moved * moved.positions[v].cast<double>();
-    EXPECT_GT(synthetic::signed_distance(scene.body, p), -0.004);
+    EXPECT_GT(synthetic::signed_distance(scene.body, p), -unsure_m);
   }
 }
 
@@ -196,7 +198,7 @@ TEST(VisualHull, ACameraThatSeesAPartOnlyAmputatesNothing) {
   }
   const Mesh mesh = hull_mesh(scene);
   EXPECT_TRUE(topology(mesh).closed_manifold());
-  EXPECT_LT(deepest_cut_m(mesh, scene.body), 0.005);
+  EXPECT_LT(deepest_cut_m(mesh, scene.body), unsure_m);
   EXPECT_LE(volume_m3(mesh), volume_m3(whole) + 1e-9);
   EXPECT_GT(volume_m3(mesh), 0.9 * volume_m3(whole));
 }
@@ -253,7 +255,7 @@ TEST(VisualHull, ACameraThatSeesNobodyIsNamedAndLeftOut) {
   ASSERT_EQ(hull->warnings.size(), 1U);
   EXPECT_THAT(hull->warnings[0], HasSubstr(scene.silhouettes[2].camera));
   EXPECT_EQ(hull->cameras.size(), scene.silhouettes.size() - 1);
-  EXPECT_LT(deepest_cut_m(extract_surface(hull->field), scene.body), 0.005);
+  EXPECT_LT(deepest_cut_m(extract_surface(hull->field), scene.body), unsure_m);
 }
 
 /// Blanks a square of a silhouette around a point of the world.
@@ -271,25 +273,25 @@ TEST(VisualHull, OneSilhouetteWithoutAForearmIsOverruledAndNamed) {
   ASSERT_NE(hand, joints.end());
   Scene scene = person_scene();
   const double whole = volume_m3(hull_mesh(scene));
-  blank_around(scene.rig, scene.silhouettes[0], hand->second, 9);
+  blank_around(scene.rig, scene.silhouettes[0], hand->second, 7);
   const auto hull = carve_visual_hull(scene.rig, scene.silhouettes, {.voxel_m = 0.01});
   ASSERT_TRUE(hull.ok());
   ASSERT_EQ(hull->warnings.size(), 1U);
   EXPECT_THAT(hull->warnings[0], HasSubstr(scene.silhouettes[0].camera));
   const Mesh mesh = extract_surface(hull->field);
-  EXPECT_LT(deepest_cut_m(mesh, scene.body), 0.004);
+  EXPECT_LT(deepest_cut_m(mesh, scene.body), unsure_m);
   EXPECT_LT(volume_m3(mesh), 1.03 * whole);
 }
 
 TEST(VisualHull, AHoleInOneSilhouetteMakesNoTunnel) {
   Scene scene = person_scene();
-  for (const int reach_px : {0, 2}) {
+  for (const int reach_px : {0, 1}) {
     SCOPED_TRACE(reach_px);
     scene.silhouettes = person_scene().silhouettes;
     blank_around(scene.rig, scene.silhouettes[3], {0, 1.15, 0}, reach_px);
     const auto hull = carve_visual_hull(scene.rig, scene.silhouettes, {.voxel_m = 0.01});
     ASSERT_TRUE(hull.ok());
-    EXPECT_LT(deepest_cut_m(extract_surface(hull->field), scene.body), 0.004);
+    EXPECT_LT(deepest_cut_m(extract_surface(hull->field), scene.body), unsure_m);
   }
 }
 
@@ -321,7 +323,7 @@ TEST(VisualHull, RefusesWhatCannotWork) {
   for (size_t c = 0; c < disjoint.size(); ++c)
     for (int y = 0; y < disjoint[c].coverage.height; ++y)
       for (int x = 0; x < disjoint[c].coverage.width; ++x)
-        disjoint[c].coverage.at(x, y) = (c == 0 ? y < 20 : y > 200) ? 255 : 0;
+        disjoint[c].coverage.at(x, y) = (c == 0 ? y < 15 : y > 150) ? 255 : 0;
   EXPECT_EQ(code(disjoint, {.voxel_m = 0.02}), ErrorCode::no_subject);
   std::vector<Silhouette> twice = scene.silhouettes;
   twice.push_back(twice[0]);
