@@ -197,6 +197,7 @@ void Booth::adopt_orphans() {
     jobs_->add(
         {.id = id, .face = face_mode_from(recording->face) ? recording->face : "auto", .label = recording->label});
     if (const auto written = jobs_->persist(id); !written) spdlog::error("{}", written.error().message);
+    jobs_->release(id);
   }
   for (const Job& job : jobs_->list()) {
     if (fs::exists(booth.recordings() / job.id, code) || avatars_->find(job.id)) continue;

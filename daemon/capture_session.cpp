@@ -206,6 +206,7 @@ void CaptureSession::carry_out(const std::string& id, const CaptureRequest& requ
   parts_.metrics.add("captures_done");
   spdlog::info("capture {}: done", id);
   parts_.events.publish(CaptureDone{id, id});
+  parts_.jobs.release(id);  // so that listeners hear of the capture's end before the job's beginning
 }
 
 Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& request,

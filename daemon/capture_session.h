@@ -30,7 +30,7 @@ namespace booth {
 struct CaptureRequest {
   FaceMode face = FaceMode::automatic;
   double countdown_s = 0;  ///< 0 … 60
-  std::string label;       ///< may be empty
+  std::string label = {};  ///< may be empty
 };
 
 /// What a capture works with; all of it outlives the session.

@@ -130,11 +130,8 @@ std::optional<Job> JobQueue::find(const std::string& id) const {
 }
 
 void JobQueue::add(const Job& job) {
-  {
-    const std::lock_guard lock(mutex_);
-    entries_.try_emplace(job.id, Entry{.job = job});
-  }
-  queued_.notify_one();
+  const std::lock_guard lock(mutex_);
+  if (entries_.try_emplace(job.id, Entry{.job = job}).second) occupied_.insert(job.id);
 }
 
 Result<void> JobQueue::retry(const std::string& id) {
@@ -262,10 +259,10 @@ void JobQueue::give_back(const Lease& lease) {
   entry->lease = 0;
 }
 
-void JobQueue::release(const Lease& lease) {
+void JobQueue::release(const std::string& id) {
   {
     const std::lock_guard lock(mutex_);
-    occupied_.erase(lease.job.id);
+    occupied_.erase(id);
   }
   released_.notify_all();
   queued_.notify_all();

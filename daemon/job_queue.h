@@ -48,8 +48,9 @@ class JobQueue {
   std::vector<Job> list() const;  ///< oldest first
   std::optional<Job> find(const std::string& id) const;
 
-  /// A new job, queued. One that is already there is left alone.
+  /// A new job, queued. One that is already there is left alone. No worker takes it before release(id).
   void add(const Job& job);
+  void release(const std::string& id);
   /// @error not_found; invalid_state  neither failed nor cancelled
   Result<void> retry(const std::string& id);
   /// The job is cancelled from now on; a worker that has it sees so by is_wanted.
@@ -80,8 +81,8 @@ class JobQueue {
   /// The job goes back into the queue, and this run does not count: the daemon is stopping.
   void give_back(const Lease& lease);
   /// The worker has left nothing behind, neither a process nor files that should not be.
-  void release(const Lease& lease);
-  /// Waits until no worker has anything of that job any more.
+  void release(const Lease& lease) { release(lease.job.id); }
+  /// Waits until no worker has anything of that job any more, and whoever added it has released it.
   void wait_released(const std::string& id);
 
  private:
@@ -100,7 +101,7 @@ class JobQueue {
   std::condition_variable_any queued_;
   std::map<std::string, Entry> entries_;  ///< guarded by mutex_; ids sort by their time
   uint64_t leases_ = 0;                   ///< guarded by mutex_
-  std::set<std::string> occupied_;        ///< guarded by mutex_; ids that a worker has not released
+  std::set<std::string> occupied_;        ///< guarded by mutex_; ids that a worker, or who added them, has not released
   std::condition_variable_any released_;
 };
 

@@ -44,7 +44,7 @@ constexpr size_t most_pending = 4096;  ///< requests that wait for the disk
 constexpr int requests_in_a_row = 64;  ///< before the events have their turn
 constexpr std::chrono::milliseconds longest_sleep{500};
 /// A request is answered within 100 ms; some of that is spent on the way.
-constexpr std::chrono::milliseconds early_answer{70};
+constexpr std::chrono::milliseconds early_answer{85};
 constexpr std::chrono::milliseconds farewell{200};  ///< for the last answers and events at the end
 
 /// The answers that other threads give.

@@ -1,0 +1,49 @@
+#!/bin/sh
+# In place of booth-reconstruct: does what the file "behaviour" beside it says.
+recording=$1
+avatar=$2
+here=$(dirname "$0")
+say() { printf '%s\n' "$1" >&3; }
+publish() {
+  partial=$(dirname "$avatar")/.partial-$(basename "$avatar").1.1
+  mkdir "$partial" && printf 0123456789 >"$partial/avatar.dae" &&
+    printf '{"id": "%s", "created": "2026-11-22T10:15:00Z", "recording": "%s", "triangles": 12, "warnings": ["w"],
+             "files": {"avatar.dae": {}}}' "$(basename "$avatar")" "$(basename "$recording")" >"$partial/metadata.json" &&
+    mv -T "$partial" "$avatar"
+}
+echo "$@" >>"$here/calls"
+case $(cat "$here/behaviour") in
+  good)
+    say '{"stage": "load", "fraction": 0.1}'
+    say 'nonsense'
+    say '{"stage": "hull", "fraction": 0.6}'
+    say '{"stage": "export", "fraction": 0.5}'
+    publish
+    ;;
+  fail)
+    say '{"error": {"kind": "no_subject", "message": "nobody is in the pictures"}}'
+    exit 1
+    ;;
+  silent_fail)
+    echo 'out of luck' >&2
+    exit 3
+    ;;
+  crash) kill -SEGV $$ ;;
+  crash_once)
+    if [ -e "$here/crashed" ]; then publish; else
+      : >"$here/crashed"
+      kill -SEGV $$
+    fi
+    ;;
+  nothing) exit 0 ;;
+  hang)
+    echo $$ >"$here/pid"
+    say '{"stage": "hull", "fraction": 0.3}'
+    exec sleep 1000
+    ;;
+  slow)
+    say '{"stage": "hull", "fraction": 0.3}'
+    sleep 0.3
+    publish
+    ;;
+esac

@@ -1,0 +1,246 @@
+#include <gmock/gmock.h>
+
+#include "daemon/job_queue.h"
+#include "tests/daemon/test_booth.h"
+
+namespace booth::test {
+namespace {
+
+using testing::HasSubstr;
+using testing::IsEmpty;
+using testing::SizeIs;
+
+class Jobs : public TestBooth {
+ protected:
+  void start_with(const std::string& behaviour) {
+    reconstruct_.behave(behaviour);
+    start();
+  }
+  std::string quick_capture() { return capture({{"face", "none"}}); }
+  bool avatars_are_clean() { return entries(options_.config.booth.avatars()).empty(); }
+};
+
+TEST_F(Jobs, AFailureIsTold) {
+  start_with("fail");
+  Listener listener(options_.config.api.events);
+  const std::string id = quick_capture();
+  const auto failed = listener.find("job.failed");
+  ASSERT_TRUE(failed);
+  EXPECT_EQ(failed->fields["error"], Json({{"kind", "no_subject"}, {"message", "nobody is in the pictures"}}));
+  EXPECT_EQ(job(id)["state"], "failed");
+  EXPECT_EQ(job(id)["error"]["kind"], "no_subject");
+  EXPECT_TRUE(job(id).at("avatar").is_null());
+  EXPECT_THAT(call("system.status")["queue"], SizeIs(1));
+  EXPECT_TRUE(avatars_are_clean());
+  EXPECT_EQ(refusal("job.cancel", {{"job", id}}), "invalid_state");
+}
+
+TEST_F(Jobs, AFailureWithoutAWordIsToldToo) {
+  start_with("silent_fail");
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "failed"));
+  EXPECT_EQ(job(id)["error"]["kind"], "internal");
+  EXPECT_THAT(job(id)["error"]["message"].get<std::string>(), HasSubstr("status 3: out of luck"));
+}
+
+TEST_F(Jobs, ACrashIsRetriedOnceThenFails) {
+  start_with("crash");
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "failed"));
+  EXPECT_EQ(reconstruct_.calls(), 2);
+  EXPECT_EQ(job(id)["error"]["kind"], "internal");
+  EXPECT_THAT(job(id)["error"]["message"].get<std::string>(), HasSubstr("signal 11"));
+  EXPECT_EQ(call("system.status")["state"], "idle");
+}
+
+TEST_F(Jobs, ACrashThatDoesNotRepeatIsMended) {
+  start_with("crash_once");
+  EXPECT_TRUE(wait_job(quick_capture(), "done"));
+}
+
+TEST_F(Jobs, NoAvatarIsAFailure) {
+  start_with("nothing");
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "failed"));
+  EXPECT_EQ(job(id)["error"]["kind"], "internal");
+}
+
+TEST_F(Jobs, AProgramThatIsNotThereIsAFailure) {
+  options_.reconstruct_command = folder_.path() / "nothing";
+  start();
+  EXPECT_TRUE(wait_job(quick_capture(), "failed"));
+}
+
+TEST_F(Jobs, TakesNoLongerThanAllowed) {
+  options_.config.jobs.timeout_s = 1;
+  start_with("hang");
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "failed"));
+  EXPECT_EQ(job(id)["error"]["kind"], "timeout");
+}
+
+TEST_F(Jobs, TheBoothTakesTheNextCaptureMeanwhile) {
+  start_with("hang");
+  ASSERT_TRUE(wait_job(quick_capture(), "running"));
+  EXPECT_EQ(call("system.status")["state"], "idle");
+  EXPECT_TRUE(wait_job(quick_capture(), "queued"));
+}
+
+TEST_F(Jobs, ARunningOneIsCancelledAndRetried) {
+  start_with("hang");
+  Listener listener(options_.config.api.events);
+  const std::string id = quick_capture();
+  ASSERT_TRUE(listener.find("job.progress"));
+  EXPECT_EQ(job(id)["stage"], "hull");
+  EXPECT_EQ(refusal("job.retry", {{"job", id}}), "invalid_state");
+  call("job.cancel", {{"job", id}});
+  EXPECT_EQ(job(id)["state"], "cancelled");
+  const auto cancelled = listener.find("job.cancelled");
+  ASSERT_TRUE(cancelled);
+  EXPECT_EQ(cancelled->fields["job"], id);
+  EXPECT_EQ(refusal("job.cancel", {{"job", id}}), "invalid_state");
+
+  reconstruct_.behave("good");
+  call("job.retry", {{"job", id}});
+  ASSERT_TRUE(listener.find("avatar.published"));
+  EXPECT_EQ(job(id)["state"], "done");
+  EXPECT_EQ(refusal("job.retry", {{"job", id}}), "invalid_state");
+}
+
+TEST_F(Jobs, AQueuedOneIsCancelledForGood) {
+  start_with("hang");
+  const std::string first = quick_capture();
+  ASSERT_TRUE(wait_job(first, "running"));
+  const std::string second = quick_capture();
+  ASSERT_TRUE(wait_job(second, "queued"));
+  call("job.cancel", {{"job", second}});
+  stop();
+  reconstruct_.behave("good");
+  start();
+  EXPECT_TRUE(wait_job(first, "done")) << "the running one goes on";
+  EXPECT_EQ(job(second)["state"], "cancelled");
+  EXPECT_EQ(job(second)["error"]["kind"], "cancelled");
+}
+
+TEST_F(Jobs, ARunningOneIsDeletedWithEverything) {
+  start_with("hang");
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_until([&] { return job(id)["stage"] == "hull"; }));
+  call("capture.delete", {{"capture", id}});
+  EXPECT_TRUE(wait_until([&] { return traces(id).empty(); }));
+  EXPECT_EQ(job(id)["state"], "not_found");
+}
+
+TEST_F(Jobs, CancelledAtAnyMomentLeavesNoAvatar) {
+  start();
+  for (int i = 0; i < 12; ++i) {
+    const std::string id = quick_capture();
+    ASSERT_TRUE(wait_until([&] { return job(id)["state"] != "not_found"; }));
+    std::this_thread::sleep_for(std::chrono::milliseconds(2 * i));
+    const bool cancelled = refusal("job.cancel", {{"job", id}}).empty();
+    ASSERT_TRUE(wait_job(id, cancelled ? "cancelled" : "done"));
+    if (cancelled) {
+      EXPECT_TRUE(wait_until([&] { return !fs::exists(options_.config.booth.avatars() / id); }));
+      EXPECT_EQ(refusal("avatar.get", {{"avatar", id}}), "not_found");
+    }
+  }
+}
+
+TEST_F(Jobs, DeletingAnAvatarDeletesThePerson) {
+  start();
+  Listener listener(options_.config.api.events);
+  const std::string id = quick_capture();
+  ASSERT_TRUE(listener.find("avatar.published"));
+  EXPECT_EQ(call("avatar.delete", {{"avatar", id}}), Json::object());
+  EXPECT_TRUE(wait_until([&] { return traces(id).empty(); }));
+  const auto deleted = listener.find("avatar.deleted");
+  ASSERT_TRUE(deleted);
+  EXPECT_EQ(deleted->fields["avatar"], id);
+  EXPECT_THAT(call("avatar.list")["avatars"], IsEmpty());
+  EXPECT_EQ(call("avatar.delete", {{"avatar", id}}), Json::object());
+}
+
+TEST_F(Jobs, ACaptureWithoutAJobGetsOneAtTheStart) {
+  start_with("hang");
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "running"));
+  stop();
+  fs::remove(options_.config.booth.jobs() / (id + ".json"));
+  std::ofstream(options_.config.booth.jobs() / "broken.json") << "{\"id\":";
+  reconstruct_.behave("good");
+  start();
+  EXPECT_TRUE(wait_job(id, "done"));
+  EXPECT_THAT(call("job.list")["jobs"], SizeIs(1));
+}
+
+TEST_F(Jobs, AJobWithoutACaptureGoesAtTheStart) {
+  start_with("hang");
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "running"));
+  stop();
+  fs::remove_all(options_.config.booth.recordings() / id);
+  start();
+  EXPECT_THAT(call("job.list")["jobs"], IsEmpty());
+}
+
+TEST_F(Jobs, AnInterruptedDeletionIsFinishedAtTheStart) {
+  start();
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "done"));
+  stop();
+  std::ofstream(options_.config.booth.state_directory / "deleting" / id);
+  start();
+  EXPECT_THAT(traces(id), IsEmpty());
+  EXPECT_THAT(call("avatar.list")["avatars"], IsEmpty());
+}
+
+TEST_F(Jobs, HalfMadeThingsAreClearedAwayAtTheStart) {
+  const auto& config = options_.config.booth;
+  for (const fs::path& parent : {config.recordings(), config.avatars(), config.backgrounds()})
+    fs::create_directories(parent / ".partial-x.1.1" / "frames");
+  start();
+  EXPECT_THAT(traces(".partial"), IsEmpty());
+}
+
+TEST_F(Jobs, AnAvatarThatAppearedBeforeTheCrashIsPublished) {
+  start_with("hang");
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "running"));
+  stop();
+  const size_t calls = reconstruct_.calls();
+  const fs::path folder = options_.config.booth.avatars() / id;
+  fs::create_directories(folder);
+  std::ofstream(folder / "metadata.json") << Json{{"id", id}, {"recording", id}, {"created", "2026-11-22T10:15:00Z"}};
+  start();
+  EXPECT_TRUE(wait_job(id, "done"));
+  EXPECT_EQ(reconstruct_.calls(), calls);
+}
+
+TEST(JobQueue, AJobThatIsThereWheneverTheDaemonDiesFailsAtLast) {
+  const ScratchFolder folder;
+  EventBus events;
+  {
+    auto queue = JobQueue::open(folder.path(), events);
+    ASSERT_TRUE(queue);
+    (*queue)->add({.id = "poison", .face = "auto"});
+    (*queue)->release("poison");
+    ASSERT_TRUE((*queue)->persist("poison"));
+  }
+  int starts = 0;
+  for (; starts < 100; ++starts) {
+    auto queue = JobQueue::open(folder.path(), events);
+    ASSERT_TRUE(queue);
+    const auto lease = (*queue)->take({}, std::chrono::milliseconds(0));
+    if (!lease) break;
+    ASSERT_TRUE((*queue)->persist("poison"));  // and here the daemon dies
+  }
+  EXPECT_GT(starts, 3);
+  EXPECT_LT(starts, 100);
+  auto queue = JobQueue::open(folder.path(), events);
+  EXPECT_EQ((*queue)->find("poison")->state, JobState::failed);
+  ASSERT_TRUE((*queue)->retry("poison"));
+  EXPECT_EQ((*queue)->find("poison")->state, JobState::queued);
+}
+
+}  // namespace
+}  // namespace booth::test

@@ -1,0 +1,180 @@
+#include <gmock/gmock.h>
+#include <signal.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <random>
+#include <set>
+
+#include "tests/daemon/test_booth.h"
+
+namespace booth::test {
+namespace {
+
+using testing::IsEmpty;
+using testing::SizeIs;
+
+/// The real programs, as processes of their own.
+class Process : public TestBooth {
+ protected:
+  void SetUp() override {
+    TestBooth::SetUp();
+    config_ = folder_.path() / "boothd.toml";
+    std::ofstream(config_) << write_config(options_.config);
+  }
+  void TearDown() override {
+    if (boothd_ > 0) ::kill(boothd_, SIGKILL), wait_exit();
+  }
+
+  static pid_t spawn(const std::vector<std::string>& command, const fs::path& output) {
+    const pid_t pid = ::fork();
+    if (pid != 0) return pid;
+    std::vector<char*> arguments;
+    for (const std::string& argument : command) arguments.push_back(const_cast<char*>(argument.c_str()));
+    arguments.push_back(nullptr);
+    if (::freopen(output.c_str(), "a", stdout) != nullptr && ::dup2(STDOUT_FILENO, STDERR_FILENO) >= 0)
+      ::execv(arguments[0], arguments.data());
+    ::_exit(127);
+  }
+  /// Its exit status, and what it wrote.
+  std::pair<int, std::string> run(std::vector<std::string> command) {
+    const fs::path output = folder_.path() / "output";
+    fs::remove(output);
+    int status = 0;
+    ::waitpid(spawn(command, output), &status, 0);
+    std::ifstream file(output);
+    return {WIFEXITED(status) ? WEXITSTATUS(status) : -1, std::string((std::istreambuf_iterator<char>(file)), {})};
+  }
+  std::pair<int, std::string> boothctl(const std::vector<std::string>& arguments) {
+    std::vector<std::string> command{
+        BOOTHCTL, "--control", options_.config.api.control, "--events", options_.config.api.events, "--timeout", "30"};
+    command.insert(command.end(), arguments.begin(), arguments.end());
+    return run(command);
+  }
+  void start_boothd() {
+    boothd_ = spawn({BOOTHD, "--config", config_, "--reconstruct", reconstruct_.path()}, folder_.path() / "log");
+    client_ = std::make_unique<RawClient>(options_.config.api.control);
+    ASSERT_TRUE(wait_until([&] { return call("system.status")["ready"] == true; }));
+  }
+  int wait_exit() {
+    int status = 0;
+    ::waitpid(boothd_, &status, 0);
+    boothd_ = -1;
+    return status;
+  }
+  void expect_all_whole() {
+    for (const std::string& id : entries(options_.config.booth.recordings())) {
+      if (id.starts_with(".")) continue;  // nobody takes it for a recording
+      const auto recording = read_recording(options_.config.booth.recordings() / id);
+      ASSERT_TRUE(recording) << recording.error().message;
+      for (const Shot& shot : recording->shots) EXPECT_THAT(load_shot(*recording, shot).faults, IsEmpty());
+    }
+    for (const std::string& id : entries(options_.config.booth.avatars())) {
+      if (!id.starts_with(".")) {
+        EXPECT_TRUE(fs::exists(options_.config.booth.avatars() / id / "metadata.json")) << id;
+      }
+    }
+  }
+
+  fs::path config_;
+  pid_t boothd_ = -1;
+};
+
+TEST_F(Process, KilledAtAnyMomentLosesNothingThatWasDone) {
+  constexpr int rounds = 12;
+  std::mt19937 random(7);
+  std::set<std::string> done;
+  reconstruct_.behave("slow");
+  for (int round = 0; round < rounds; ++round) {
+    start_boothd();
+    const Json jobs = call("job.list");
+    for (const Json& job : jobs["jobs"]) EXPECT_NE(job["state"], "failed") << job;
+    capture();
+    const auto until = std::chrono::steady_clock::now() + std::chrono::milliseconds(random() % 400);
+    while (std::chrono::steady_clock::now() < until)
+      if (const Json now = call("job.list"); !now["jobs"].empty()) done.insert(now["jobs"].back()["id"]);
+    ::kill(boothd_, SIGKILL);
+    wait_exit();
+    expect_all_whole();
+  }
+  start_boothd();
+  ASSERT_TRUE(wait_until([&] { return call("system.status")["queue"].empty(); }));
+  EXPECT_TRUE(wait_until([&] { return traces(".partial").empty(); }));
+  std::set<std::string> avatars;
+  const Json list = call("avatar.list");
+  for (const Json& avatar : list["avatars"]) avatars.insert(avatar["id"]);
+  for (const std::string& id : done) EXPECT_EQ(avatars.count(id), 1) << id << " was lost";
+  EXPECT_THAT(entries(options_.config.booth.recordings()), SizeIs(avatars.size()));
+}
+
+TEST_F(Process, TheReconstructionDiesWithTheDaemon) {
+  reconstruct_.behave("hang");
+  start_boothd();
+  const std::string id = capture({{"face", "none"}});
+  ASSERT_TRUE(wait_until([&] { return job(id)["stage"] == "hull"; }));
+  ::kill(boothd_, SIGKILL);
+  wait_exit();
+  int pid = 0;
+  std::ifstream(folder_.path() / "pid") >> pid;
+  const auto lives = [&] {
+    std::ifstream file("/proc/" + std::to_string(pid) + "/stat");
+    const std::string text((std::istreambuf_iterator<char>(file)), {});
+    return !text.empty() && text.find(") Z ") == std::string::npos;
+  };
+  EXPECT_TRUE(wait_until([&] { return !lives(); }));
+}
+
+TEST_F(Process, EndsCleanlyOnASignal) {
+  reconstruct_.behave("hang");
+  for (const int signal : {SIGTERM, SIGINT}) {
+    start_boothd();
+    capture({{"face", "none"}});
+    ::kill(boothd_, signal);
+    const int status = wait_exit();
+    EXPECT_TRUE(WIFEXITED(status) && WEXITSTATUS(status) == 0) << status;
+    expect_all_whole();
+  }
+  EXPECT_THAT(traces(".partial"), IsEmpty());
+}
+
+TEST_F(Process, BoothctlOperatesIt) {
+  EXPECT_EQ(run({BOOTHCTL, "--control", options_.config.api.control, "--timeout", "0.2", "status"}).first, 3);
+  start_boothd();
+  EXPECT_EQ(boothctl({"status"}).first, 0);
+  EXPECT_THAT(boothctl({"status"}).second, testing::HasSubstr("ready       yes"));
+  EXPECT_EQ(Json::parse(boothctl({"--json", "status"}).second)["state"], "idle");
+
+  const auto [status, output] = boothctl({"capture", "--label", "Zoë", "--countdown", "0.2", "--wait"});
+  ASSERT_EQ(status, 0);
+  const std::string id = output.substr(0, output.find('\n'));
+  EXPECT_EQ(Json::parse(boothctl({"--json", "avatars", "list"}).second)["avatars"][0]["id"], id);
+  const fs::path to = folder_.path() / "got";
+  EXPECT_EQ(boothctl({"avatars", "fetch", id, "--to", to}).first, 0);
+  std::ifstream file(to / "avatar.dae");
+  EXPECT_EQ(std::string((std::istreambuf_iterator<char>(file)), {}), "0123456789");
+  EXPECT_EQ(boothctl({"avatars", "fetch", id, "nothing", "--to", to}).first, 1);
+  EXPECT_THAT(boothctl({"jobs"}).second, testing::HasSubstr("done"));
+  EXPECT_EQ(boothctl({"retry", id}).first, 1);
+  EXPECT_EQ(boothctl({"avatars", "delete", id}).first, 0);
+  EXPECT_TRUE(wait_until([&] { return traces(id).empty(); }));
+
+  reconstruct_.behave("fail");
+  EXPECT_EQ(boothctl({"capture", "--wait"}).first, 1);
+  EXPECT_EQ(boothctl({"capture", "--face", "pretty"}).first, 2);
+  EXPECT_EQ(boothctl({}).first, 2);
+  EXPECT_EQ(boothctl({"--help"}).first, 0);
+  EXPECT_EQ(boothctl({"shutdown"}).first, 0);
+  const int ended = wait_exit();
+  EXPECT_TRUE(WIFEXITED(ended) && WEXITSTATUS(ended) == 0);
+}
+
+TEST_F(Process, RefusesABadConfiguration) {
+  EXPECT_EQ(run({BOOTHD, "--config", config_, "--reconstruct", reconstruct_.path(), "--check"}).first, 0);
+  std::ofstream(config_) << "[jobs]\nworkers = 0\n[disk]\nreserve = 1\n";
+  EXPECT_EQ(run({BOOTHD, "--config", config_, "--check"}).first, 2);
+  EXPECT_EQ(run({BOOTHD, "--config", config_}).first, 2);
+  EXPECT_EQ(run({BOOTHD, "--config", folder_.path() / "nothing"}).first, 2);
+}
+
+}  // namespace
+}  // namespace booth::test
