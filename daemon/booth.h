@@ -141,10 +141,10 @@ class Booth {
   EventBus events_;
   Metrics metrics_;
   int state_lock_ = -1;  ///< an open descriptor, locked while this booth uses the state directory
-  SerialExecutor disk_executor_;
 
   std::unique_ptr<JobQueue> jobs_;
   std::unique_ptr<AvatarStore> avatars_;
+  SerialExecutor disk_executor_;  ///< its tasks use the two above
   std::unique_ptr<BackgroundStore> backgrounds_;
   CalibrationStatus calibration_;
   std::string device_fault_;  ///< why there are no devices; empty when there are

@@ -3,6 +3,7 @@
 #include <poll.h>
 #include <signal.h>
 #include <spdlog/spdlog.h>
+#include <sys/resource.h>
 #include <sys/signalfd.h>
 #include <systemd/sd-daemon.h>
 #include <unistd.h>
@@ -62,6 +63,14 @@ class SignalDescriptor {
   int fd_ = -1;
 };
 
+/// Each client and each camera takes descriptors; the default is meant for programs that use select().
+void allow_many_descriptors() {
+  rlimit limit{};
+  if (::getrlimit(RLIMIT_NOFILE, &limit) != 0) return;
+  limit.rlim_cur = limit.rlim_max;
+  if (::setrlimit(RLIMIT_NOFILE, &limit) != 0) spdlog::info("the limit of open files stays as it is");
+}
+
 fs::path beside_this_program(const char* name) {
   std::error_code code;
   return fs::read_symlink("/proc/self/exe", code).parent_path() / name;
@@ -118,6 +127,7 @@ int run(const Arguments& arguments) {
     return 0;
   }
 
+  allow_many_descriptors();
   const SignalDescriptor signals;
   const MonotonicClock clock;
   Wakeup shut_down;

@@ -3,6 +3,7 @@
 #include <fcntl.h>
 #include <signal.h>
 #include <sys/prctl.h>
+#include <sys/resource.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -18,6 +19,7 @@ namespace {
 constexpr int progress_number = 3;  ///< the descriptor on which the child reports
 /// The kernel takes the child before the daemon when memory runs out.
 constexpr std::string_view out_of_memory_score = "500";
+constexpr int niceness = 5;  ///< a capture goes before
 
 struct Pipe {
   int read = -1, write = -1;
@@ -46,6 +48,8 @@ void write_errno(int descriptor) {
   ::setpgid(0, 0);
   ::prctl(PR_SET_PDEATHSIG, SIGKILL);
   if (::getppid() != parent) ::_exit(exec_failed);  // the daemon died before the line above
+
+  ::setpriority(PRIO_PROCESS, 0, niceness);
 
   sigset_t none;
   sigemptyset(&none);

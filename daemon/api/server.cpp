@@ -47,6 +47,8 @@ constexpr std::chrono::milliseconds longest_sleep{500};
 constexpr std::chrono::milliseconds early_answer{85};
 constexpr std::chrono::milliseconds farewell{200};  ///< for the last answers and events at the end
 
+constexpr const char* key_was_used = "key: it was used for another request before";
+
 /// The answers that other threads give.
 struct Completions {
   std::mutex mutex;
@@ -63,7 +65,8 @@ struct Pending {
   std::optional<std::string> key;
   Json params;  ///< of a request with a key
   SteadyClock::time_point received;
-  std::optional<Reply> early;  ///< what is answered when it takes long
+  std::optional<Reply> early;    ///< what is answered when it takes long
+  std::vector<Pending> repeats;  ///< of the same request, which get the same answer
 };
 
 struct Refusal {
@@ -295,11 +298,20 @@ void Server::Content::carry_out(Pending request) {
         keys->find(*request.key, std::string(request.method->name), request.params, KeyStore::Clock::now());
     if (std::holds_alternative<KeyStore::OtherRequest>(found)) {
       request.key.reset();
-      return answer(request, Error{ErrorCode::invalid_argument, "key: it was used for another request before"});
+      return answer(request, Error{ErrorCode::invalid_argument, key_was_used});
     }
     if (const auto* result = std::get_if<std::string>(&found)) {
       request.key.reset();  // it is remembered already, and not for longer
       return answer(request, Reply{Json::parse(*result)});
+    }
+    const auto first = std::find_if(pending.begin(), pending.end(),
+                                    [&](const auto& entry) { return entry.second.key == request.key; });
+    if (first != pending.end()) {
+      request.key.reset();
+      if (first->second.method != request.method || first->second.params != request.params)
+        return answer(request, Error{ErrorCode::invalid_argument, key_was_used});
+      first->second.repeats.push_back(std::move(request));
+      return;
     }
   }
   if (pending.size() >= most_pending)
@@ -354,6 +366,7 @@ void Server::Content::answer_early() {
 }
 
 void Server::Content::answer(Pending& request, const Answer& given) {
+  for (Pending& repeat : request.repeats) answer(repeat, given);
   const std::string method(request.method->name);
   booth.metrics().observe("request_seconds",
                           std::chrono::duration<double>(SteadyClock::now() - request.received).count());

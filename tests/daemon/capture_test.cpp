@@ -18,7 +18,7 @@ class Capture : public TestBooth {
  protected:
   void start_listening() {
     start();
-    listener_ = std::make_unique<Listener>(options_.config.api.events);
+    listener_ = std::make_unique<Listener>(options_.config.api.events, booth_.get());
   }
   Listener& listener() { return *listener_; }
   /// The kind of the failure, or "done".

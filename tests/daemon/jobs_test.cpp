@@ -22,7 +22,7 @@ class Jobs : public TestBooth {
 
 TEST_F(Jobs, AFailureIsTold) {
   start_with("fail");
-  Listener listener(options_.config.api.events);
+  Listener listener(options_.config.api.events, booth_.get());
   const std::string id = quick_capture();
   const auto failed = listener.find("job.failed");
   ASSERT_TRUE(failed);
@@ -88,7 +88,7 @@ TEST_F(Jobs, TheBoothTakesTheNextCaptureMeanwhile) {
 
 TEST_F(Jobs, ARunningOneIsCancelledAndRetried) {
   start_with("hang");
-  Listener listener(options_.config.api.events);
+  Listener listener(options_.config.api.events, booth_.get());
   const std::string id = quick_capture();
   ASSERT_TRUE(listener.find("job.progress"));
   EXPECT_EQ(job(id)["stage"], "hull");
@@ -148,7 +148,7 @@ TEST_F(Jobs, CancelledAtAnyMomentLeavesNoAvatar) {
 
 TEST_F(Jobs, DeletingAnAvatarDeletesThePerson) {
   start();
-  Listener listener(options_.config.api.events);
+  Listener listener(options_.config.api.events, booth_.get());
   const std::string id = quick_capture();
   ASSERT_TRUE(listener.find("avatar.published"));
   EXPECT_EQ(call("avatar.delete", {{"avatar", id}}), Json::object());

@@ -1,5 +1,7 @@
 #include <gmock/gmock.h>
 
+#include <map>
+
 #include "pipeline/export/sha256.h"
 #include "tests/daemon/test_booth.h"
 
@@ -204,6 +206,25 @@ TEST_F(Methods, AKeyGivesTheFirstAnswerAgain) {
   EXPECT_EQ(capture(params), id) << "after a restart";
   EXPECT_THAT(call("job.list")["jobs"], SizeIs(1));
   EXPECT_EQ(refusal("capture.start", {{"key", "k1"}, {"label", "Bob"}}), "invalid_params");
+}
+
+TEST_F(Methods, AKeyGivesTheSameAnswerWhileTheFirstIsAwaited) {
+  reconstruct_.behave("hang");
+  const std::string id = capture();
+  ASSERT_TRUE(wait_job(id, "running"));
+  const auto cancel = [&](int number, const std::string& job) {
+    return Json{{"jsonrpc", "2.0"}, {"id", number}, {"method", "job.cancel"}, {"params", {{"job", job}, {"key", "k"}}}}
+        .dump();
+  };
+  for (int i = 0; i < 3; ++i) client().send({cancel(i, id)});
+  client().send({cancel(3, "another")});
+  std::map<int, std::string> kinds;
+  for (int i = 0; i < 4; ++i) {
+    const Response response = client().receive_response();
+    kinds[response.message["id"]] = response.kind();
+  }
+  EXPECT_THAT(kinds, testing::ElementsAre(testing::Pair(0, ""), testing::Pair(1, ""), testing::Pair(2, ""),
+                                          testing::Pair(3, "invalid_params")));
 }
 
 TEST_F(Methods, ErrorsAreNotRemembered) {

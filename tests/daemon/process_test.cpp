@@ -26,13 +26,14 @@ class Process : public TestBooth {
     if (boothd_ > 0) ::kill(boothd_, SIGKILL), wait_exit();
   }
 
-  static pid_t spawn(const std::vector<std::string>& command, const fs::path& output) {
+  /// What it says goes to a file; a daemon's log too.
+  static pid_t spawn(const std::vector<std::string>& command, const fs::path& output, bool log = false) {
     const pid_t pid = ::fork();
     if (pid != 0) return pid;
     std::vector<char*> arguments;
     for (const std::string& argument : command) arguments.push_back(const_cast<char*>(argument.c_str()));
     arguments.push_back(nullptr);
-    if (::freopen(output.c_str(), "a", stdout) != nullptr && ::dup2(STDOUT_FILENO, STDERR_FILENO) >= 0)
+    if (::freopen(output.c_str(), "a", stdout) != nullptr && (!log || ::dup2(STDOUT_FILENO, STDERR_FILENO) >= 0))
       ::execv(arguments[0], arguments.data());
     ::_exit(127);
   }
@@ -52,7 +53,7 @@ class Process : public TestBooth {
     return run(command);
   }
   void start_boothd() {
-    boothd_ = spawn({BOOTHD, "--config", config_, "--reconstruct", reconstruct_.path()}, folder_.path() / "log");
+    boothd_ = spawn({BOOTHD, "--config", config_, "--reconstruct", reconstruct_.path()}, folder_.path() / "log", true);
     client_ = std::make_unique<RawClient>(options_.config.api.control);
     ASSERT_TRUE(wait_until([&] { return call("system.status")["ready"] == true; }));
   }

@@ -144,7 +144,7 @@ TEST_F(Protocol, ASubscriberThatDoesNotReadHoldsUpNobody) {
   slow.set(zmq::sockopt::rcvhwm, 1);
   slow.set(zmq::sockopt::subscribe, "");
   slow.connect(options_.config.api.events);
-  Listener listener(options_.config.api.events);
+  Listener listener(options_.config.api.events, booth_.get());
   for (int i = 0; i < 5000; ++i) {
     booth_->events().publish(Alert{Severity::info, "test", std::string(500, 'x')});
     if (i % 500 == 0) call("system.describe");
@@ -154,7 +154,7 @@ TEST_F(Protocol, ASubscriberThatDoesNotReadHoldsUpNobody) {
 }
 
 TEST_F(Protocol, EventsCountWithoutGaps) {
-  Listener listener(options_.config.api.events);
+  Listener listener(options_.config.api.events, booth_.get());
   const std::string id = capture();
   ASSERT_TRUE(listener.find("avatar.published"));
   ASSERT_TRUE(listener.find("heartbeat"));

@@ -174,24 +174,23 @@ struct SeenEvent {
 /// Hears every event from its construction on.
 class Listener {
  public:
-  explicit Listener(const std::string& endpoint) : socket_(context_, zmq::socket_type::sub) {
+  /// @param booth  of this process, which is made to say something at once; else its heartbeat is waited for
+  explicit Listener(const std::string& endpoint, Booth* booth = nullptr) : socket_(context_, zmq::socket_type::sub) {
     socket_.set(zmq::sockopt::linger, 0);
     socket_.set(zmq::sockopt::subscribe, "");
-    socket_.set(zmq::sockopt::rcvtimeo, 100);
+    socket_.set(zmq::sockopt::rcvtimeo, 20);
     socket_.connect(endpoint);
-    // The first heartbeat shows that the subscription has arrived.
-    EXPECT_TRUE(find([](const SeenEvent& event) { return event.topic == "heartbeat"; }));
+    // The first event shows that the subscription has arrived.
+    EXPECT_TRUE(wait_until([&] {
+      if (booth != nullptr) booth->events().publish(Alert{Severity::info, "test", "is anybody there?"});
+      return receive();
+    }));
   }
   /// The next event, heard already or not, that is as wanted; those before it are skipped.
   std::optional<SeenEvent> find(const std::function<bool(const SeenEvent&)>& wanted) {
     const auto deadline = std::chrono::steady_clock::now() + long_enough;
-    while (std::chrono::steady_clock::now() < deadline) {
-      zmq::message_t topic, fields;
-      if (!socket_.recv(topic, zmq::recv_flags::none)) continue;
-      static_cast<void>(socket_.recv(fields, zmq::recv_flags::none));
-      heard_.push_back({topic.to_string(), Json::parse(fields.to_string_view())});
-      if (wanted(heard_.back())) return heard_.back();
-    }
+    while (std::chrono::steady_clock::now() < deadline)
+      if (receive() && wanted(heard_.back())) return heard_.back();
     return std::nullopt;
   }
   std::optional<SeenEvent> find(const std::string& topic) {
@@ -206,6 +205,15 @@ class Listener {
   }
 
  private:
+  /// @return whether one came
+  bool receive() {
+    zmq::message_t topic, fields;
+    if (!socket_.recv(topic, zmq::recv_flags::none)) return false;
+    static_cast<void>(socket_.recv(fields, zmq::recv_flags::none));
+    heard_.push_back({topic.to_string(), Json::parse(fields.to_string_view())});
+    return true;
+  }
+
   zmq::context_t context_;
   zmq::socket_t socket_;
   std::vector<SeenEvent> heard_;
