@@ -108,6 +108,28 @@ TEST_F(Process, KilledAtAnyMomentLosesNothingThatWasDone) {
   EXPECT_THAT(entries(options_.config.booth.recordings()), SizeIs(avatars.size()));
 }
 
+TEST_F(Process, WhatWasDeletedStaysDeletedWhenKilled) {
+  constexpr int rounds = 6;
+  std::mt19937 random(11);
+  reconstruct_.behave("slow");
+  std::vector<std::string> deleted;
+  for (int round = 0; round < rounds; ++round) {
+    start_boothd();
+    for (const std::string& id : deleted) EXPECT_THAT(traces(id), IsEmpty());
+    deleted.push_back(capture({{"face", "none"}}));
+    std::this_thread::sleep_for(std::chrono::milliseconds(random() % 500));  // anywhere between countdown and avatar
+    client().send(
+        {Json{{"jsonrpc", "2.0"}, {"id", 1}, {"method", "capture.delete"}, {"params", {{"capture", deleted.back()}}}}
+             .dump()});
+    EXPECT_EQ(client().receive_response().kind(), "");
+    ::kill(boothd_, SIGKILL);
+    wait_exit();
+  }
+  start_boothd();
+  for (const std::string& id : deleted) EXPECT_THAT(traces(id), IsEmpty());
+  EXPECT_TRUE(call("job.list")["jobs"].empty());
+}
+
 TEST_F(Process, TheReconstructionDiesWithTheDaemon) {
   reconstruct_.behave("hang");
   start_boothd();
