@@ -234,9 +234,9 @@ void Server::Content::receive() {
         frames.push_back(std::move(frame));
     }
     if (too_many || frames.size() < 2) continue;  // the first frame is the client's identity
-    const zmq::message_t text = std::move(frames.back());
+    const std::string text = frames.back().to_string();
     frames.pop_back();
-    accept(std::move(frames), text.to_string_view());
+    accept(std::move(frames), text);
   }
   // Subscriptions come in as messages that nobody needs.
   zmq::message_t subscription;

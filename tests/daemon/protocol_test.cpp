@@ -145,7 +145,7 @@ TEST_F(Protocol, ASubscriberThatDoesNotReadHoldsUpNobody) {
   slow.set(zmq::sockopt::subscribe, "");
   slow.connect(options_.config.api.events);
   Listener listener(options_.config.api.events, booth_.get());
-  for (int i = 0; i < 5000; ++i) {
+  for (int i = 0; i < 3000; ++i) {
     booth_->events().publish(Alert{Severity::info, "test", std::string(500, 'x')});
     if (i % 500 == 0) call("system.describe");
   }

@@ -210,7 +210,7 @@ class Listener {
     zmq::message_t topic, fields;
     if (!socket_.recv(topic, zmq::recv_flags::none)) return false;
     static_cast<void>(socket_.recv(fields, zmq::recv_flags::none));
-    heard_.push_back({topic.to_string(), Json::parse(fields.to_string_view())});
+    heard_.push_back({topic.to_string(), Json::parse(fields.to_string())});
     return true;
   }
 
