@@ -77,11 +77,6 @@ struct BoothStatus {
   double uptime_s = 0;
 };
 
-struct JobSummary {
-  Job job;
-  bool has_avatar = false;
-};
-
 /// The booth: its devices, its captures, its jobs and its avatars, put together. It knows nothing of how it is talked
 /// to. Any thread may call; calls that wait for the disk say so.
 class Booth {

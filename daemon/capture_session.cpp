@@ -71,6 +71,7 @@ Result<std::string> CaptureSession::start(const CaptureRequest& request) {
   if (request.face == FaceMode::active && !projector_)
     return Error{ErrorCode::unsupported, "this booth has no projector: choose the face mode passive or none"};
   const std::string id = make_capture_id(std::chrono::system_clock::now());
+  const std::lock_guard transition(transition_mutex_);
   {
     const std::lock_guard lock(mutex_);
     if (draining_) return Error{ErrorCode::not_ready, "the booth is stopping"};
@@ -143,11 +144,15 @@ void CaptureSession::run(const std::stop_token& stop) {
         cancelled = capture_->stop.get_token();
       }
     }
-    if (!id.empty()) {
-      carry_out(id, request, cancelled);
-    } else if (std::chrono::steady_clock::now() - tended >= device_pause) {
-      tend_devices();
-      tended = std::chrono::steady_clock::now();
+    try {
+      if (!id.empty()) {
+        carry_out(id, request, cancelled);
+      } else if (std::chrono::steady_clock::now() - tended >= device_pause) {
+        tend_devices();
+        tended = std::chrono::steady_clock::now();
+      }
+    } catch (const std::exception& fault) {
+      spdlog::error("the capture thread: {}", fault.what());
     }
   }
 }
@@ -168,29 +173,7 @@ void CaptureSession::carry_out(const std::string& id, const CaptureRequest& requ
     taken = Error{ErrorCode::internal, "the booth's program has a fault: " + std::string(fault.what())};
   }
 
-  bool kept = false;
-  {
-    const std::lock_guard lock(mutex_);
-    kept = taken.ok() && !capture_->abandoned;
-    if (kept) {
-      parts_.jobs.add({.id = id, .face = std::string(to_string(request.face)), .label = request.label});
-      capture_.reset();
-    }
-  }
-  if (taken && !kept) {
-    // Deleted while it was written. Whoever waits for its end finds nothing left.
-    if (const auto removed = remove_folder(parts_.recordings, id); !removed)
-      spdlog::error("capture {}: {}", id, removed.error().message);
-    taken = Error{ErrorCode::cancelled, "the capture was deleted"};
-  }
-  if (!kept) {
-    const std::lock_guard lock(mutex_);
-    if (!capture_->abandoned) over_.push_back(id);
-    if (over_.size() > remembered_failures) over_.pop_front();
-    capture_.reset();
-  }
-  changed_.notify_all();
-  parts_.set_state(BoothState::idle);
+  if (!conclude(id, request, taken.ok()) && taken) taken = Error{ErrorCode::cancelled, "the capture was deleted"};
 
   parts_.metrics.observe("capture_seconds", elapsed_s(started, parts_.clock.now()));
   if (!taken) {
@@ -207,6 +190,32 @@ void CaptureSession::carry_out(const std::string& id, const CaptureRequest& requ
   spdlog::info("capture {}: done", id);
   parts_.events.publish(CaptureDone{id, id});
   parts_.jobs.release(id);  // so that listeners hear of the capture's end before the job's beginning
+}
+
+/// The capture is over. @return whether its recording stays, and its job is queued
+bool CaptureSession::conclude(const std::string& id, const CaptureRequest& request, bool taken) {
+  bool stays = taken;
+  if (taken) {
+    const std::lock_guard lock(mutex_);
+    stays = !capture_->abandoned;
+    // From here on whoever deletes it finds the job.
+    if (stays) parts_.jobs.add({.id = id, .face = std::string(to_string(request.face)), .label = request.label});
+  }
+  if (taken && !stays) {
+    // Deleted while it was written: whoever waits for its end finds nothing left.
+    if (const auto removed = remove_folder(parts_.recordings, id); !removed)
+      spdlog::error("capture {}: {}", id, removed.error().message);
+  }
+  const std::lock_guard transition(transition_mutex_);
+  {
+    const std::lock_guard lock(mutex_);
+    if (!stays && !capture_->abandoned) over_.push_back(id);
+    if (over_.size() > remembered_failures) over_.pop_front();
+    capture_.reset();
+  }
+  changed_.notify_all();
+  parts_.set_state(BoothState::idle);
+  return stays;
 }
 
 Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& request,

@@ -85,6 +85,7 @@ class CaptureSession {
   void run(const std::stop_token& stop);
   void tend_devices();
   void carry_out(const std::string& id, const CaptureRequest& request, const std::stop_token& cancelled);
+  bool conclude(const std::string& id, const CaptureRequest& request, bool taken);
 
   // The steps of a capture, in their order.
   Result<void> take(const std::string& id, const CaptureRequest& request, const std::stop_token& cancelled);
@@ -106,6 +107,7 @@ class CaptureSession {
   ThreadPool encoders_;
   Pulse pulse_;
 
+  std::mutex transition_mutex_;  ///< held from a capture's beginning, or end, until the state says so; before mutex_
   mutable std::mutex mutex_;
   std::condition_variable_any changed_;
   std::optional<Capture> capture_;  ///< guarded by mutex_; the one under way
