@@ -4,6 +4,7 @@
 
 #include "drivers/clock.h"
 #include "pipeline/types/result.h"
+#include "pipeline/types/shot.h"
 
 namespace booth {
 
@@ -13,6 +14,8 @@ class Trigger {
   virtual ~Trigger() = default;
   /// "replay", "gpio", "software", "action".
   virtual const std::string& driver() const = 0;
+  /// What the next triggers are for, where that makes a difference: which shots are lit.
+  virtual void prepare(ShotRole /*role*/) noexcept {}
   /// Fires once. @return when, on the booth's clock. @error device_lost
   virtual Result<Timestamp> fire() = 0;
 };
