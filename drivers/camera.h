@@ -61,6 +61,10 @@ class Camera {
   /// Trigger number `index` fired at `when`. Cameras without a trigger line choose by it the frame that answers.
   virtual void note_trigger(int /*index*/, Timestamp /*when*/) noexcept {}
 
+  /// Whether it is still there, as far as the driver has heard without asking it for a picture. Never waits.
+  /// @error device_lost
+  virtual Result<void> check_presence() const { return {}; }
+
   /// What the transport counts; empty where there is nothing to count.
   virtual std::vector<Statistic> statistics() const { return {}; }
 

@@ -23,6 +23,9 @@ constexpr const char* projector_name = "projector";
 /// Between the end of an exposure and the frame's arrival: readout and transfer of a common industrial camera.
 constexpr Timestamp transfer_ns = milliseconds(15);
 
+/// Between two frames of a preview.
+constexpr Timestamp preview_period_ns = milliseconds(50);
+
 /// The clock cannot wake anybody: who waits for it looks again at least this often.
 constexpr std::chrono::milliseconds longest_nap{10};
 
@@ -88,6 +91,8 @@ struct Channel : Socket {
   int fired = 0;    ///< of those
   int capture = 0;  ///< how often it had been armed for this role before
   std::map<ShotRole, int> arms;
+  const FrameRecord* preview = nullptr;  ///< what it shows; null where it is armed for triggers
+  Timestamp begun = 0, last = 0;         ///< of the preview: when it was armed, and its newest frame's time
   uint64_t frame_id = 0;
   std::deque<Arrival> arrivals;
   std::condition_variable arrived;
@@ -157,7 +162,36 @@ class ReplayStage {
 
   const CameraInfo& info(const std::string& camera) const { return channels_.at(camera).info; }
 
-  Result<void> arm(const std::string& camera, ShotRole role, int count) {
+  Result<void> check_presence(const std::string& camera) {
+    const std::lock_guard lock(mutex_);
+    if (channels_.at(camera).lost) return lost(camera);
+    return {};
+  }
+
+  Result<void> arm(const std::string& camera, const CaptureSettings& settings, int count) {
+    if (settings.mode == CaptureMode::preview) return arm_preview(camera, settings.role);
+    if (const auto armed = arm_triggered(camera, settings.role, count); !armed) return armed;
+    // As a real camera's sensor, a played one should have its picture ready when it is asked for it.
+    if (settings.role == ShotRole::body || settings.role == ShotRole::background) preload(camera, settings.role);
+    return {};
+  }
+
+  Result<void> arm_preview(const std::string& camera, ShotRole role) {
+    const std::lock_guard lock(mutex_);
+    Channel& channel = channels_.at(camera);
+    if (channel.lost) return lost(camera);
+    channel.preview = first_picture(camera, role);
+    for (auto shot = shots_.begin(); shot != shots_.end() && channel.preview == nullptr; ++shot)
+      channel.preview = first_picture(camera, shot->first);
+    if (channel.preview == nullptr)
+      return Error{ErrorCode::unsupported, camera + ": the recording " + recording_.id + " has no picture of it"};
+    channel.armed = true;
+    channel.arrivals.clear();
+    channel.begun = channel.last = clock_.now();
+    return {};
+  }
+
+  Result<void> arm_triggered(const std::string& camera, ShotRole role, int count) {
     const std::lock_guard lock(mutex_);
     Channel& channel = channels_.at(camera);
     if (channel.lost) return lost(camera);
@@ -166,6 +200,7 @@ class ReplayStage {
       return Error{ErrorCode::unsupported, camera + ": the recording " + recording_.id + " has no " +
                                                std::string(to_string(role)) + " shot to replay"};
     channel.armed = true;
+    channel.preview = nullptr;
     channel.role = role;
     channel.count = count;
     channel.fired = 0;
@@ -191,6 +226,7 @@ class ReplayStage {
         if (channel.lost) return lost(camera);
         if (!channel.armed) return Error{ErrorCode::cancelled, camera + ": was stopped"};
         const Timestamp now = clock_.now();
+        if (channel.preview != nullptr) look(channel, now);
         if (!channel.arrivals.empty() && channel.arrivals.front().due <= now) break;
         if (now >= deadline) return Error{ErrorCode::timeout, camera + ": delivered no frame in time"};
         const Timestamp due = channel.arrivals.empty() ? deadline : std::min(deadline, channel.arrivals.front().due);
@@ -208,7 +244,7 @@ class ReplayStage {
     const Timestamp now = clock_.now();
     bool board = false;
     for (auto& [id, channel] : channels_) {
-      if (!channel.armed || channel.lost || channel.fired == channel.count) continue;
+      if (!channel.armed || channel.preview != nullptr || channel.lost || channel.fired == channel.count) continue;
       board |= channel.role == ShotRole::calibration_board;
       expose(channel, now);
     }
@@ -330,6 +366,43 @@ class ReplayStage {
     channel.arrived.notify_all();
   }
 
+  /// Puts the preview's newest frame among the arrivals, when it is time for one.
+  static void look(Channel& channel, Timestamp now) {
+    const Timestamp step = (now - channel.begun) / preview_period_ns;
+    const Timestamp taken = channel.begun + step * preview_period_ns;
+    if (!channel.arrivals.empty() && channel.arrivals.front().due >= taken) return;
+    channel.arrivals.clear();
+    Arrival arrival;
+    arrival.record = channel.preview;
+    arrival.due = taken > channel.last ? taken : taken + preview_period_ns;
+    const auto index = (arrival.due - channel.begun) / preview_period_ns;
+    channel.last = arrival.due;
+    arrival.frame = {.camera = channel.info.id,
+                     .index = static_cast<int>(index - 1),
+                     .timestamp_ns = arrival.due,
+                     .frame_id = ++channel.frame_id,
+                     .exposure_us = channel.preview->exposure_us,
+                     .gain_db = channel.preview->gain_db,
+                     .pixels = nullptr};
+    channel.arrivals.push_back(std::move(arrival));
+  }
+
+  /// The camera's first frame in the shot of that role, or nullptr.
+  const FrameRecord* first_picture(const std::string& camera, ShotRole role) const {
+    const auto shot = shots_.find(role);
+    if (shot == shots_.end()) return nullptr;
+    for (const auto& [index, frames] : shot->second.frames)
+      if (const auto frame = frames.find(camera); frame != frames.end()) return frame->second;
+    return nullptr;
+  }
+
+  /// Decodes that picture, where there is one and it is not damaged.
+  void preload(const std::string& camera, ShotRole role) {
+    const FrameRecord* record = first_picture(camera, role);
+    if (record == nullptr || cache_.find(record->file).pixels) return;
+    if (auto loaded = load_frame(recording_, *record)) cache_.keep(record->file, *loaded);
+  }
+
   Result<Frame> decode(Arrival arrival) {
     const FrameRecord& record = *arrival.record;
     const auto damaged = [&](const std::string& what) {
@@ -375,10 +448,9 @@ class ReplayCamera final : public Camera {
   ReplayCamera(std::shared_ptr<ReplayStage> stage, const std::string& id) : stage_(std::move(stage)), id_(id) {}
   ~ReplayCamera() override { stage_->close_camera(id_); }
   const CameraInfo& info() const override { return stage_->info(id_); }
-  Result<void> arm(const CaptureSettings& settings, int count) override {
-    return stage_->arm(id_, settings.role, count);
-  }
+  Result<void> arm(const CaptureSettings& settings, int count) override { return stage_->arm(id_, settings, count); }
   Result<Frame> wait_frame(Timestamp deadline) override { return stage_->wait_frame(id_, deadline); }
+  Result<void> check_presence() const override { return stage_->check_presence(id_); }
   void stop() noexcept override { stage_->disarm(id_); }
 
  private:

@@ -20,7 +20,8 @@ class ReplayStage;
 /// pattern that the projector shows at that instant (dark: the all-black one), a calibration_board shot with the pose
 /// after the last one, also across arms. A camera without such a frame stays silent, as a broken one would. Timestamps
 /// are the trigger's instant plus the recorded offset between the cameras. Frames are decoded by the thread that waits
-/// for them, and carry their encoded bytes.
+/// for them, and carry their encoded bytes. In preview mode a camera shows its first picture of the role it was armed
+/// for (of any role, where it has none), 20 times a second.
 class ReplaySource final : public DeviceSource {
  public:
   /// @param clock  outlives the source and its devices

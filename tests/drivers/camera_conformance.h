@@ -199,6 +199,35 @@ TEST_P(CameraConformance, WorksAgainAfterStop) {
   }
 }
 
+TEST_P(CameraConformance, PreviewsWithoutATriggerAndTakesTriggersAfterwards) {
+  const auto camera = open_camera();
+  const auto trigger = open_trigger();
+  ASSERT_TRUE(camera && trigger);
+  ASSERT_TRUE(camera->arm({.role = under_test.role, .mode = CaptureMode::preview}, 1));
+  int last = -1;
+  for (int i = 0; i < 3; ++i) {
+    const Timestamp asked = clock.now();
+    const auto frame = camera->wait_frame(soon());
+    ASSERT_TRUE(frame) << frame.error().message;
+    EXPECT_GT(frame->index, last);
+    last = frame->index;
+    EXPECT_EQ(frame->pixels->width, camera->info().width);
+    EXPECT_GT(frame->timestamp_ns, asked - seconds(1));
+  }
+  ASSERT_TRUE(arm(*camera, 1));
+  EXPECT_EQ(camera->wait_frame(clock.now() + not_long).error().code, ErrorCode::timeout) << "the preview is over";
+  ASSERT_TRUE(trigger->fire());
+  const auto frame = camera->wait_frame(soon());
+  ASSERT_TRUE(frame) << frame.error().message;
+  EXPECT_EQ(frame->index, 0);
+}
+
+TEST_P(CameraConformance, IsPresentWhileItIsOpen) {
+  const auto camera = open_camera();
+  ASSERT_TRUE(camera);
+  EXPECT_TRUE(camera->check_presence());
+}
+
 TEST_P(CameraConformance, PixelsOutliveTheCamera) {
   auto camera = open_camera();
   const auto trigger = open_trigger();
@@ -224,6 +253,7 @@ TEST_P(CameraConformance, ALostCameraSaysSoAndComesBack) {
     EXPECT_EQ(camera->wait_frame(clock.now() + seconds(600)).error().code, ErrorCode::device_lost);
   }
   EXPECT_EQ(arm(*camera, 1).error().code, ErrorCode::device_lost);
+  EXPECT_EQ(camera->check_presence().error().code, ErrorCode::device_lost);
   EXPECT_EQ(under_test.source->open_camera(under_test.camera).error().code, ErrorCode::device_lost);
   camera.reset();
   EXPECT_EQ(under_test.source->open_camera(under_test.camera).error().code, ErrorCode::device_lost);
