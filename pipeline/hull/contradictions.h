@@ -4,7 +4,7 @@
 #include <cstddef>
 #include <vector>
 
-#include "pipeline/hull/silhouette_view.h"
+#include "pipeline/geometry/silhouette_view.h"
 #include "pipeline/types/field.h"
 #include "pipeline/types/image.h"
 #include "pipeline/types/work.h"

@@ -6,8 +6,8 @@
 #include <memory>
 #include <string>
 
+#include "pipeline/geometry/silhouette_view.h"
 #include "pipeline/hull/contradictions.h"
-#include "pipeline/hull/silhouette_view.h"
 #include "pipeline/hull/solid_parts.h"
 
 namespace booth {
@@ -309,6 +309,7 @@ Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette>
   if (work.stopped()) return Work::cancelled();
   if (parts.kept_samples == 0)
     return Error{ErrorCode::no_subject, "no point of the capture volume is inside all silhouettes"};
+  hull.views = std::move(views);
   work.report(1);
   return hull;
 }

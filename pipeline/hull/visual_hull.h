@@ -4,6 +4,7 @@
 #include <string>
 #include <vector>
 
+#include "pipeline/geometry/silhouette_view.h"
 #include "pipeline/types/field.h"
 #include "pipeline/types/rig.h"
 #include "pipeline/types/silhouette.h"
@@ -18,6 +19,8 @@ struct VisualHullOptions {
 
 struct VisualHull {
   Field field;  ///< metres where stored, cut off at two voxels; negative inside, positive on the grid's border
+  SilhouetteViews
+      views;  ///< the silhouettes that it explains: overruled where a camera was; of cameras in the rig given
   std::vector<std::string> cameras;   ///< ids of the cameras that were used
   std::vector<std::string> warnings;  ///< sentences for an operator
 };

@@ -1,4 +1,4 @@
-#include "pipeline/hull/outline_distance.h"
+#include "pipeline/geometry/outline_distance.h"
 
 #include <gtest/gtest.h>
 

@@ -5,7 +5,7 @@
 #include <memory>
 #include <vector>
 
-#include "pipeline/hull/outline_distance.h"
+#include "pipeline/geometry/outline_distance.h"
 #include "pipeline/types/image.h"
 #include "pipeline/types/rig.h"
 

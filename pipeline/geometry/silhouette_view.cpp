@@ -1,4 +1,4 @@
-#include "pipeline/hull/silhouette_view.h"
+#include "pipeline/geometry/silhouette_view.h"
 
 #include <Eigen/SVD>
 #include <algorithm>
