@@ -2,6 +2,8 @@
 
 #include <cmath>
 #include <cstdint>
+#include <limits>
+#include <numeric>
 
 #include "pipeline/segmentation/smoothing.h"
 
@@ -9,40 +11,60 @@ namespace booth::segmentation {
 namespace {
 
 /// Cells the grid should have about: fine enough for fingers, coarse enough to be quick.
-constexpr double target_cells = 400000;
+constexpr double target_cells = 120000;
 /// Beyond this many pixels a cell would swallow fingers, however large the sensor is.
 constexpr int max_step = 4;
 
-template <int channels, int step>
-void add_columns(const std::vector<uint16_t>& columns, int cells, std::vector<uint32_t>& cell_sums) {
-  for (int x = 0; x < cells; ++x) {
-    for (int c = 0; c < channels; ++c) {
-      uint32_t sum = 0;
-      for (int dx = 0; dx < step; ++dx) sum += columns[static_cast<size_t>((x * step + dx) * channels + c)];
-      cell_sums[static_cast<size_t>(x * channels + c)] = sum;
-    }
+/// Sums over the pixels of each cell of one cell row; pixels beyond the image repeat its last ones.
+class CellRow {
+ public:
+  CellRow(const CellGrid& grid, int channels)
+      : grid_(grid),
+        channels_(static_cast<size_t>(channels)),
+        columns_(static_cast<size_t>(grid.width * grid.step) * channels_),
+        windows_(columns_.size()) {
+    for (size_t c = 0; c < channels_; ++c) sums_[c].resize(static_cast<size_t>(grid.width));
   }
-}
 
-/// Sums over the pixels of each cell of one cell row, channel by channel interleaved; pixels beyond the image
-/// repeat its last ones.
-void sum_cell_row(const Image& image, const CellGrid& grid, int cell_y, std::vector<uint16_t>& columns,
-                  std::vector<uint32_t>& cell_sums) {
-  const auto channels = static_cast<size_t>(image.channels);
-  const size_t row_samples = static_cast<size_t>(image.width) * channels;
-  const size_t padded_samples = static_cast<size_t>(grid.width * grid.step) * channels;
-  columns.assign(padded_samples, 0);
-  for (int dy = 0; dy < grid.step; ++dy) {
-    const uint8_t* row = image.pixel(0, std::min(cell_y * grid.step + dy, image.height - 1));
-    for (size_t i = 0; i < row_samples; ++i) columns[i] = static_cast<uint16_t>(columns[i] + row[i]);
+  /// @param offset  how far the image has moved: it is read that much to the left of and above the grid
+  void add_up(const Image& image, int cell_y, const PixelOffset& offset) {
+    const int first = std::clamp(offset.x, 0, image.width - 1);  // column of the grid's pixels that the image has
+    const int skipped = std::clamp(-offset.x, 0, image.width - 1);
+    const int count = std::min(image.width - skipped, grid_.width * grid_.step - first);
+    const size_t begin = static_cast<size_t>(first) * channels_;
+    const size_t end = begin + static_cast<size_t>(count) * channels_;
+    for (int dy = 0; dy < grid_.step; ++dy) {
+      const uint8_t* row = image.pixel(skipped, std::clamp(cell_y * grid_.step + dy - offset.y, 0, image.height - 1));
+      uint16_t* columns = columns_.data() + begin;
+      if (dy == 0) std::copy(row, row + (end - begin), columns);
+      if (dy > 0) add(row, end - begin, columns);
+    }
+    for (size_t i = end; i < columns_.size(); ++i) columns_[i] = columns_[i - channels_];
+    for (size_t i = begin; i-- > 0;) columns_[i] = columns_[i + channels_];
+    // The sum of every step neighbouring pixels, though a step-th of them would do: this way it runs in vectors.
+    const auto step = static_cast<size_t>(grid_.step);
+    std::copy(columns_.begin(), columns_.end(), windows_.begin());
+    for (size_t n = 1; n < step; ++n)
+      add(columns_.data() + n * channels_, columns_.size() - n * channels_, windows_.data());
+    for (size_t c = 0; c < channels_; ++c)
+      for (size_t x = 0; x < sums_[c].size(); ++x) sums_[c][x] = windows_[x * step * channels_ + c];
   }
-  for (size_t i = row_samples; i < padded_samples; ++i) columns[i] = columns[i - channels];
-  static_assert(max_step == 4);
-  using Add = void (*)(const std::vector<uint16_t>&, int, std::vector<uint32_t>&);
-  constexpr std::array<Add, max_step> grey{add_columns<1, 1>, add_columns<1, 2>, add_columns<1, 3>, add_columns<1, 4>};
-  constexpr std::array<Add, max_step> color{add_columns<3, 1>, add_columns<3, 2>, add_columns<3, 3>, add_columns<3, 4>};
-  (channels == 1 ? grey : color)[static_cast<size_t>(grid.step - 1)](columns, grid.width, cell_sums);
-}
+
+  /// By cell of the row.
+  const std::vector<uint16_t>& sums(size_t channel) const { return sums_[channel]; }
+
+ private:
+  template <class Value>
+  static void add(const Value* in, size_t count, uint16_t* out) {
+    for (size_t i = 0; i < count; ++i) out[i] = static_cast<uint16_t>(out[i] + in[i]);
+  }
+
+  CellGrid grid_;
+  size_t channels_;
+  std::vector<uint16_t> columns_, windows_;
+  std::array<std::vector<uint16_t>, 3> sums_;
+};
+static_assert(max_step * max_step * 255 <= std::numeric_limits<uint16_t>::max());
 
 CellPlanes make_planes(int channels, size_t count, float fill = 0) {
   CellPlanes planes;
@@ -138,78 +160,144 @@ std::array<float, 3> common_drift(const CellPlanes& difference, const CellGrid& 
   return {green + red_shift, green, green + blue_shift};
 }
 
-/// Whether a cell's difference can be the drift expected there, give or take the slack.
-bool agrees_with(const CellPlanes& difference, const CellPlanes& drift, size_t cell, float slack) {
-  std::array<float, 3> deviation{};
-  for (int c = 0; c < difference.channels; ++c) {
-    deviation[c] = difference.values[c][cell] - drift.values[c][cell];
-    if (std::abs(deviation[c]) > slack) return false;
+/// A drift that varies slowly over the image: known at the centres of blocks, linear in between.
+class Drift {
+ public:
+  Drift(const CellGrid& grid, int channels, const std::array<float, 3>& everywhere)
+      : grid_(grid),
+        nx_((grid.width + drift_block - 1) / drift_block),
+        ny_((grid.height + drift_block - 1) / drift_block),
+        blocks_(make_planes(channels, static_cast<size_t>(nx_) * static_cast<size_t>(ny_))) {
+    for (int c = 0; c < channels; ++c) std::fill(blocks_.values[c].begin(), blocks_.values[c].end(), everywhere[c]);
   }
-  if (difference.channels == 1) return true;
-  return std::abs(deviation[0] - deviation[1]) < drift_chroma_slack &&
-         std::abs(deviation[2] - deviation[1]) < drift_chroma_slack;
-}
 
-/// Block values at every cell of every row_stride-th row, linear between the blocks' centres.
-void expand_blocks(const std::vector<float>& blocks, int nx, int ny, const CellGrid& grid, int row_stride,
-                   std::vector<float>& out) {
-  // Half a block at either end repeats the first or last value: one more block there makes all alike.
-  std::vector<float> row(static_cast<size_t>(nx) + 2);
-  constexpr int half = drift_block / 2;
-  for (int y = 0; y < grid.height; y += row_stride) {
-    const int upper = std::clamp((y + half) / drift_block - 1, 0, ny - 1);
-    const int lower = std::min((y + half) / drift_block, ny - 1);
+  /// Of the cells of a row.
+  void row(int channel, int y, std::vector<float>& cells) const {
+    // Half a block at either end repeats the first or last value: one more block there makes all alike.
+    std::vector<float> ends(static_cast<size_t>(nx_) + 2);
+    constexpr int half = drift_block / 2;
+    const int upper = std::clamp((y + half) / drift_block - 1, 0, ny_ - 1);
+    const int lower = std::min((y + half) / drift_block, ny_ - 1);
     const float down = (static_cast<float>((y + half) % drift_block) + 0.5F) / drift_block;
-    const float* a = blocks.data() + static_cast<size_t>(upper) * static_cast<size_t>(nx);
-    const float* b = blocks.data() + static_cast<size_t>(lower) * static_cast<size_t>(nx);
-    for (int x = 0; x < nx; ++x) row[x + 1] = a[x] + down * (b[x] - a[x]);
-    row.front() = row[1];
-    row.back() = row[nx];
-    float* cells = out.data() + grid.index(0, y);
-    for (int n = 0; n <= nx; ++n) {
-      const float slope = (row[n + 1] - row[n]) / drift_block;
-      const float start = row[n] + 0.5F * slope;
+    const float* a = blocks_.values[channel].data() + static_cast<size_t>(upper) * static_cast<size_t>(nx_);
+    const float* b = blocks_.values[channel].data() + static_cast<size_t>(lower) * static_cast<size_t>(nx_);
+    for (int x = 0; x < nx_; ++x) ends[x + 1] = a[x] + down * (b[x] - a[x]);
+    ends.front() = ends[1];
+    ends.back() = ends[nx_];
+    cells.resize(static_cast<size_t>(grid_.width));
+    for (int n = 0; n <= nx_; ++n) {
+      const float slope = (ends[n + 1] - ends[n]) / drift_block;
+      const float start = ends[n] + 0.5F * slope;
       const int first = n * drift_block - half;
-      const int end = std::min(first + drift_block, grid.width);
+      const int end = std::min(first + drift_block, grid_.width);
       for (int x = std::max(first, 0); x < end; ++x) cells[x] = start + slope * static_cast<float>(x - first);
     }
   }
-}
 
-/// Replaces a drift by the mean difference, block by block and smoothed over the image, of the cells that agree with
-/// it. Where few agree, the neighbourhood's drift carries over.
-/// @param row_stride  the new drift is written to every so many rows
-/// @return share of the cells that agreed
-double refine_drift(const CellPlanes& difference, const CellGrid& grid, float slack, int row_stride,
-                    CellPlanes& drift) {
-  const int nx = (grid.width + drift_block - 1) / drift_block;
-  const int ny = (grid.height + drift_block - 1) / drift_block;
-  const size_t blocks = static_cast<size_t>(nx) * static_cast<size_t>(ny);
-  CellPlanes sums = make_planes(difference.channels, blocks);
-  std::vector<float> weight(blocks, 0);
-  size_t agreeing = 0;
-  size_t asked = 0;
-  for (int y = 0; y < grid.height; y += drift_stride) {
-    for (int x = 0; x < grid.width; x += drift_stride, ++asked) {
-      const size_t cell = grid.index(x, y);
-      const size_t block =
-          static_cast<size_t>(y / drift_block) * static_cast<size_t>(nx) + static_cast<size_t>(x / drift_block);
-      const bool agrees = agrees_with(difference, drift, cell, slack);
-      // A trace of the drift found before keeps the quotient defined where no block of the neighbourhood agrees.
-      const float share = agrees ? 1.0F : drift_inertia;
-      const CellPlanes& source = agrees ? difference : drift;
-      for (int c = 0; c < difference.channels; ++c) sums.values[c][block] += share * source.values[c][cell];
-      weight[block] += share;
-      agreeing += agrees;
+  /// Replaces the drift by the mean difference, block by block and smoothed over the image, of the cells that agree
+  /// with it. Where few agree, the neighbourhood's drift carries over.
+  /// @return share of the cells that agreed
+  double refine(const CellPlanes& difference, float slack) {
+    const int channels = difference.channels;
+    CellPlanes sums = make_planes(channels, blocks_.values[0].size());
+    std::vector<float> weight(blocks_.values[0].size(), 0);
+    std::array<std::vector<float>, 3> expected;
+    size_t agreeing = 0;
+    size_t asked = 0;
+    for (int y = 0; y < grid_.height; y += drift_stride) {
+      for (int c = 0; c < channels; ++c) row(c, y, expected[c]);
+      for (int x = 0; x < grid_.width; x += drift_stride, ++asked) {
+        const size_t cell = grid_.index(x, y);
+        const size_t block =
+            static_cast<size_t>(y / drift_block) * static_cast<size_t>(nx_) + static_cast<size_t>(x / drift_block);
+        std::array<float, 3> deviation{};
+        for (int c = 0; c < channels; ++c) deviation[c] = difference.values[c][cell] - expected[c][x];
+        const bool agrees = can_be_drift(deviation, channels, slack);
+        // A trace of the drift found before keeps the quotient defined where no block of the neighbourhood agrees.
+        const float share = agrees ? 1.0F : drift_inertia;
+        for (int c = 0; c < channels; ++c)
+          sums.values[c][block] += share * (expected[c][x] + (agrees ? deviation[c] : 0.0F));
+        weight[block] += share;
+        agreeing += agrees;
+      }
+    }
+    gaussian_blur(weight, nx_, ny_, drift_smoothing_blocks);
+    for (int c = 0; c < channels; ++c) {
+      gaussian_blur(sums.values[c], nx_, ny_, drift_smoothing_blocks);
+      for (size_t i = 0; i < weight.size(); ++i) blocks_.values[c][i] = sums.values[c][i] / weight[i];
+    }
+    return static_cast<double>(agreeing) / static_cast<double>(asked);
+  }
+
+ private:
+  /// Whether a cell that deviates so much from the drift expected there can be background.
+  static bool can_be_drift(const std::array<float, 3>& deviation, int channels, float slack) {
+    for (int c = 0; c < channels; ++c)
+      if (std::abs(deviation[c]) > slack) return false;
+    return channels == 1 || (std::abs(deviation[0] - deviation[1]) < drift_chroma_slack &&
+                             std::abs(deviation[2] - deviation[1]) < drift_chroma_slack);
+  }
+
+  CellGrid grid_;
+  int nx_, ny_;  ///< blocks
+  CellPlanes blocks_;
+};
+
+// ---- movement -------------------------------------------------------------------------------------------------
+
+/// Steps of lightness from cell to cell below this tell nothing about a movement.
+constexpr float telling_gradient = 0.02F;
+/// Cells that the movement explains to within this decide on it.
+constexpr float movement_slack = 0.06F;
+constexpr int movement_rounds = 4;
+/// Fewer telling cells than this share of the image are too few, as are such whose edges all run one way.
+constexpr double fewest_telling = 0.002;
+constexpr double least_condition = 0.02;
+
+/// How far, in cells, the image has moved: the shift that explains most of the difference at the background's edges,
+/// by Gauss–Newton on a robust sum of squares. Nothing where the background has too few edges to tell.
+std::array<float, 2> find_movement(const CellPlanes& lightness, const CellPlanes& difference, const CellGrid& grid) {
+  struct Telling {
+    float gx, gy, d;
+  };
+  std::vector<Telling> cells;
+  const int channels = lightness.channels;
+  for (int y = 1; y + 1 < grid.height; y += 2) {
+    for (int x = 1; x + 1 < grid.width; ++x) {
+      const size_t i = grid.index(x, y);
+      Telling cell{0, 0, 0};
+      for (int c = 0; c < channels; ++c) {
+        const float* v = lightness.values[c].data() + i;
+        cell.gx += v[1] - v[-1];
+        cell.gy += v[grid.width] - v[-grid.width];
+        cell.d += difference.values[c][i];
+      }
+      const float scale = 1 / static_cast<float>(channels);
+      cell = {0.5F * scale * cell.gx, 0.5F * scale * cell.gy, scale * cell.d};
+      if (std::abs(cell.gx) + std::abs(cell.gy) > telling_gradient) cells.push_back(cell);
     }
   }
-  gaussian_blur(weight, nx, ny, drift_smoothing_blocks);
-  for (int c = 0; c < difference.channels; ++c) {
-    gaussian_blur(sums.values[c], nx, ny, drift_smoothing_blocks);
-    for (size_t i = 0; i < blocks; ++i) sums.values[c][i] /= weight[i];
-    expand_blocks(sums.values[c], nx, ny, grid, row_stride, drift.values[c]);
+  std::array<float, 2> shift{0, 0};
+  if (static_cast<double>(cells.size()) < fewest_telling * static_cast<double>(grid.count())) return shift;
+  for (int round = 0; round < movement_rounds; ++round) {
+    double xx = 0, xy = 0, yy = 0, xd = 0, yd = 0;
+    for (const Telling& cell : cells) {
+      const float left = cell.d + cell.gx * shift[0] + cell.gy * shift[1];
+      // Geman and McClure's weight: who stands before the background has next to no say.
+      const float ratio = left / movement_slack;
+      const double weight = 1 / ((1 + ratio * ratio) * (1 + ratio * ratio));
+      xx += weight * cell.gx * cell.gx;
+      xy += weight * cell.gx * cell.gy;
+      yy += weight * cell.gy * cell.gy;
+      xd += weight * cell.gx * cell.d;
+      yd += weight * cell.gy * cell.d;
+    }
+    const double determinant = xx * yy - xy * xy;
+    if (determinant < least_condition * (xx + yy) * (xx + yy) / 4) return {0, 0};
+    shift = {static_cast<float>((xy * yd - yy * xd) / determinant),
+             static_cast<float>((xy * xd - xx * yd) / determinant)};
   }
-  return static_cast<double>(agreeing) / static_cast<double>(asked);
+  return shift;
 }
 
 // ---- noise ----------------------------------------------------------------------------------------------------
@@ -230,21 +318,29 @@ constexpr float vibration_px = 0.15F;
 std::array<float, noise_bins> noise_curve(const std::vector<float>& difference, const std::vector<float>& level,
                                           const CellGrid& grid) {
   std::array<std::vector<float>, noise_bins> variances;
+  const auto width = static_cast<size_t>(grid.width);
+  std::vector<float> sums(width), squares(width), levels(width);  // over the rows of a block, by column
   for (int y0 = 0; y0 + noise_block <= grid.height; y0 += noise_block) {
-    for (int x0 = 0; x0 + noise_block <= grid.width; x0 += noise_block) {
-      float sum = 0, squares = 0, levels = 0;
-      for (int y = y0; y < y0 + noise_block; ++y) {
-        for (int x = x0; x < x0 + noise_block; ++x) {
-          const size_t i = grid.index(x, y);
-          sum += difference[i];
-          squares += difference[i] * difference[i];
-          levels += level[i];
-        }
+    for (std::vector<float>* columns : {&sums, &squares, &levels}) std::fill(columns->begin(), columns->end(), 0.0F);
+    for (int y = y0; y < y0 + noise_block; ++y) {
+      const float* d = difference.data() + grid.index(0, y);
+      const float* l = level.data() + grid.index(0, y);
+      for (size_t x = 0; x < width; ++x) {
+        sums[x] += d[x];
+        squares[x] += d[x] * d[x];
+        levels[x] += l[x];
       }
+    }
+    for (size_t x0 = 0; x0 + noise_block <= width; x0 += noise_block) {
+      const auto block_sum = [x0](const std::vector<float>& columns) {
+        return std::accumulate(columns.begin() + static_cast<long>(x0),
+                               columns.begin() + static_cast<long>(x0 + noise_block), 0.0F);
+      };
       constexpr float n = noise_block * noise_block;
-      const float scale = levels / n + srgb_offset;
-      const float variance = std::max(0.0F, squares - sum * sum / n) / (n - 1) * scale * scale;
-      variances[static_cast<size_t>(std::clamp(levels / n / 256 * noise_bins, 0.0F, noise_bins - 1.0F))].push_back(
+      const float sum = block_sum(sums), mean_level = block_sum(levels) / n;
+      const float scale = mean_level + srgb_offset;
+      const float variance = std::max(0.0F, block_sum(squares) - sum * sum / n) / (n - 1) * scale * scale;
+      variances[static_cast<size_t>(std::clamp(mean_level / 256 * noise_bins, 0.0F, noise_bins - 1.0F))].push_back(
           variance);
     }
   }
@@ -270,6 +366,17 @@ std::array<float, noise_bins> noise_curve(const std::vector<float>& difference, 
   }
   for (float& v : curve) v = std::max(v, least_noise * least_noise);
   return curve;
+}
+
+/// Takes from the difference what a movement by a fraction of a cell makes at the background's edges.
+void undo_movement(const std::vector<float>& lightness, const CellGrid& grid, float x_cells, float y_cells,
+                   std::vector<float>& difference) {
+  for (int y = 1; y + 1 < grid.height; ++y) {
+    const float* v = lightness.data() + grid.index(0, y);
+    float* d = difference.data() + grid.index(0, y);
+    for (int x = 1; x + 1 < grid.width; ++x)
+      d[x] += 0.5F * (x_cells * (v[x + 1] - v[x - 1]) + y_cells * (v[x + grid.width] - v[x - grid.width]));
+  }
 }
 
 /// Of each cell of a row, the larger of the steps to the left and right, and up and down, squared and added.
@@ -299,36 +406,34 @@ CellGrid make_grid(int image_width, int image_height) {
   return grid;
 }
 
-CellFrame average_cells(const Image& image, const CellGrid& grid) {
+CellFrame average_cells(const Image& image, const CellGrid& grid, const PixelOffset& offset) {
   const size_t weight = static_cast<size_t>(grid.step) * static_cast<size_t>(grid.step);
   const std::vector<float> table = lightness_table(weight);
+  const float per_sum = 1.0F / static_cast<float>(weight);
   CellFrame frame;
   frame.lightness = make_planes(image.channels, grid.count());
   frame.level = make_planes(image.channels, grid.count());
-  std::vector<uint16_t> columns;
-  std::vector<uint32_t> cells(static_cast<size_t>(grid.width) * static_cast<size_t>(image.channels));
+  CellRow row(grid, image.channels);
   for (int y = 0; y < grid.height; ++y) {
-    sum_cell_row(image, grid, y, columns, cells);
+    row.add_up(image, y, offset);
     for (int c = 0; c < image.channels; ++c) {
+      const std::vector<uint16_t>& sums = row.sums(static_cast<size_t>(c));
       float* lightness = frame.lightness.values[c].data() + grid.index(0, y);
       float* level = frame.level.values[c].data() + grid.index(0, y);
-      for (int x = 0; x < grid.width; ++x) {
-        const uint32_t sum = cells[static_cast<size_t>(x * image.channels + c)];
-        lightness[x] = table[sum];
-        level[x] = static_cast<float>(sum) / static_cast<float>(weight);
-      }
+      for (size_t x = 0; x < sums.size(); ++x) lightness[x] = table[sums[x]];
+      for (size_t x = 0; x < sums.size(); ++x) level[x] = static_cast<float>(sums[x]) * per_sum;
     }
   }
   return frame;
 }
 
-BackgroundModel learn_background(std::span<const Frame> frames) {
+BackgroundModel learn_background(std::span<const Frame> frames, const PixelOffset& offset) {
   const Image& first = *frames[0].pixels;
   BackgroundModel model;
   model.grid = make_grid(first.width, first.height);
-  model.frames = static_cast<int>(frames.size());
+  model.offset = offset;
   if (frames.size() == 1) {
-    CellFrame only = average_cells(first, model.grid);
+    CellFrame only = average_cells(first, model.grid, offset);
     model.lightness = std::move(only.lightness);
     model.level = std::move(only.level);
     return model;
@@ -340,33 +445,37 @@ BackgroundModel learn_background(std::span<const Frame> frames) {
   model.lightness = make_planes(channels, grid.count());
   model.level = make_planes(channels, grid.count());
   model.flicker.assign(grid.count(), 0);
-  const size_t row_values = static_cast<size_t>(grid.width) * static_cast<size_t>(channels);
-  std::vector<uint16_t> columns;
-  std::vector<uint32_t> cells(row_values), total(row_values);
-  std::vector<float> squares(row_values);
   const auto n = static_cast<float>(frames.size());
   const float per_cell = 1.0F / static_cast<float>(cell_pixels);
+  const float spread_scale = per_cell * per_cell / (n - 1) / static_cast<float>(channels);
+  std::vector<CellRow> rows(frames.size(), CellRow(grid, channels));
+  std::vector<uint32_t> total(static_cast<size_t>(grid.width));
+  std::vector<float> shift(total.size()), squares(total.size());
   for (int y = 0; y < grid.height; ++y) {
-    std::fill(total.begin(), total.end(), 0U);
-    std::fill(squares.begin(), squares.end(), 0.0F);
-    for (const Frame& frame : frames) {
-      sum_cell_row(*frame.pixels, grid, y, columns, cells);
-      for (size_t i = 0; i < row_values; ++i) {
-        total[i] += cells[i];
-        const float v = static_cast<float>(cells[i]) * per_cell;
-        squares[i] += v * v;
-      }
-    }
+    for (size_t f = 0; f < frames.size(); ++f) rows[f].add_up(*frames[f].pixels, y, offset);
     float* flicker = model.flicker.data() + grid.index(0, y);
     for (int c = 0; c < channels; ++c) {
+      // Differences to the first frame are small, so that little is lost in the variance's difference of squares.
+      const std::vector<uint16_t>& reference = rows[0].sums(static_cast<size_t>(c));
+      std::copy(reference.begin(), reference.end(), total.begin());
+      std::fill(shift.begin(), shift.end(), 0.0F);
+      std::fill(squares.begin(), squares.end(), 0.0F);
+      for (size_t f = 1; f < frames.size(); ++f) {
+        const std::vector<uint16_t>& sums = rows[f].sums(static_cast<size_t>(c));
+        for (size_t x = 0; x < total.size(); ++x) {
+          const auto difference = static_cast<float>(int{sums[x]} - int{reference[x]});
+          total[x] += sums[x];
+          shift[x] += difference;
+          squares[x] += difference * difference;
+        }
+      }
       float* lightness = model.lightness.values[c].data() + grid.index(0, y);
       float* level = model.level.values[c].data() + grid.index(0, y);
-      for (int x = 0; x < grid.width; ++x) {
-        const size_t i = static_cast<size_t>(x * channels + c);
-        lightness[x] = table[total[i]];
-        level[x] = static_cast<float>(total[i]) * per_cell / n;
-        flicker[x] += std::max(0.0F, squares[i] - n * level[x] * level[x]) / (n - 1) / static_cast<float>(channels);
-      }
+      for (size_t x = 0; x < total.size(); ++x) lightness[x] = table[total[x]];
+      for (size_t x = 0; x < total.size(); ++x)
+        level[x] = static_cast<float>(static_cast<int32_t>(total[x])) * (per_cell / n);
+      for (size_t x = 0; x < total.size(); ++x)
+        flicker[x] += std::max(0.0F, squares[x] - shift[x] * shift[x] / n) * spread_scale;
     }
   }
   box_mean_3x3(model.flicker, grid.width, grid.height);
@@ -377,7 +486,6 @@ Residual compare(const BackgroundModel& background, const CellFrame& body) {
   const CellGrid& grid = background.grid;
   const int channels = background.lightness.channels;
   Residual residual;
-  residual.body = body.lightness;
   residual.difference = make_planes(channels, grid.count());
   residual.variance = make_planes(channels, grid.count());
   for (int c = 0; c < channels; ++c) {
@@ -387,18 +495,23 @@ Residual compare(const BackgroundModel& background, const CellFrame& body) {
     for (size_t i = 0; i < difference.size(); ++i) difference[i] = seen[i] - empty[i];
   }
   residual.mean_drift = common_drift(residual.difference, grid);
-  residual.drift = make_planes(channels, grid.count());
-  for (int c = 0; c < channels; ++c)
-    std::fill_n(residual.drift.values[c].begin(), grid.count(), residual.mean_drift[c]);
-  std::vector<float> gradients;
-  for (size_t n = 0; n < drift_slack.size(); ++n) {
-    // In between, the drift is needed only where it is asked about.
-    const int row_stride = n + 1 < drift_slack.size() ? drift_stride : 1;
-    residual.drift_support = refine_drift(residual.difference, grid, drift_slack[n], row_stride, residual.drift);
+  Drift drift(grid, channels, residual.mean_drift);
+  for (const float slack : drift_slack) residual.drift_support = drift.refine(residual.difference, slack);
+  std::vector<float> drift_row, gradients;
+  for (int c = 0; c < channels; ++c) {
+    for (int y = 0; y < grid.height; ++y) {
+      drift.row(c, y, drift_row);
+      float* difference = residual.difference.values[c].data() + grid.index(0, y);
+      for (int x = 0; x < grid.width; ++x) difference[x] -= drift_row[x];
+    }
   }
+  const auto [left_x, left_y] = find_movement(background.lightness, residual.difference, grid);
+  const auto step = static_cast<float>(grid.step);
+  residual.movement_px = {static_cast<float>(background.offset.x) + step * left_x,
+                          static_cast<float>(background.offset.y) + step * left_y};
   for (int c = 0; c < channels; ++c) {
     std::vector<float>& difference = residual.difference.values[c];
-    for (size_t i = 0; i < difference.size(); ++i) difference[i] -= residual.drift.values[c][i];
+    undo_movement(background.lightness.values[c], grid, left_x, left_y, difference);
 
     const std::vector<float>& level = background.level.values[c];
     const auto curve = noise_curve(difference, level, grid);
@@ -408,14 +521,18 @@ Residual compare(const BackgroundModel& background, const CellFrame& body) {
     for (int y = 0; y < grid.height; ++y) {
       squared_gradients(background.lightness.values[c], grid, y, gradients);
       const size_t row = grid.index(0, y);
+      const float* expected = level.data() + row;
       const float* seen = body.level.values[c].data() + row;
       float* variance = residual.variance.values[c].data() + row;
+      for (int x = 0; x < grid.width; ++x)
+        variance[x] = curve[static_cast<size_t>(static_cast<int>(expected[x] * (noise_bins / 256.0F)))];
+      if (!background.flicker.empty()) {
+        const float* flicker = background.flicker.data() + row;
+        for (int x = 0; x < grid.width; ++x) variance[x] = std::max(variance[x], flicker[x]);
+      }
       for (int x = 0; x < grid.width; ++x) {
-        const float expected = level[row + x];
-        float noise = curve[static_cast<size_t>(expected * (noise_bins / 256.0F))];
-        if (!background.flicker.empty()) noise = std::max(noise, background.flicker[row + x]);
-        const float scale = std::min(expected, seen[x]) + srgb_offset;
-        variance[x] = noise / (scale * scale) + shift * shift * gradients[x];
+        const float scale = std::min(expected[x], seen[x]) + srgb_offset;
+        variance[x] = variance[x] / (scale * scale) + shift * shift * gradients[x];
       }
     }
   }

@@ -9,10 +9,15 @@
 
 namespace booth::segmentation {
 
+/// By how many whole pixels the body frame's picture of the booth has moved to the right and down.
+struct PixelOffset {
+  int x = 0, y = 0;
+};
+
 /// What a camera sees without a subject, cell by cell.
 struct BackgroundModel {
   CellGrid grid;
-  int frames = 0;              ///< how many it was learned from
+  PixelOffset offset;
   CellPlanes lightness;        ///< log(v + srgb_offset) of the mean over frames and cell
   CellPlanes level;            ///< that mean, 0 … 255
   std::vector<float> flicker;  ///< variance between the frames, mean over channels and 3 × 3 cells, level²;
@@ -22,26 +27,27 @@ struct BackgroundModel {
 /// The mean and spread of the frames.
 ///
 /// @param frames  at least one, all of one size and 1 or 3 channels
-BackgroundModel learn_background(std::span<const Frame> frames);
+/// @param offset  how far they are moved first; the border repeats
+BackgroundModel learn_background(std::span<const Frame> frames, const PixelOffset& offset = {});
 
 /// A frame brought to the model's grid.
 struct CellFrame {
   CellPlanes lightness, level;
 };
-CellFrame average_cells(const Image& image, const CellGrid& grid);
+CellFrame average_cells(const Image& image, const CellGrid& grid, const PixelOffset& offset = {});
 
 /// How the body frame differs from the background model.
 struct Residual {
-  CellPlanes difference;              ///< lightness of body − background, drift removed
-  CellPlanes body;                    ///< lightness of the body frame
-  CellPlanes variance;                ///< of `difference` where nothing but noise and vibration is at work
-  CellPlanes drift;                   ///< what was removed: how much lighter the whole place became, per cell
-  std::array<float, 3> mean_drift{};  ///< the drift's constant part, per channel
-  double drift_support = 0;           ///< share of the image that agrees with the drift, 0 … 1
+  CellPlanes difference;               ///< lightness of body − background, drift and movement removed
+  CellPlanes variance;                 ///< of `difference` where nothing but noise and vibration is at work
+  std::array<float, 3> mean_drift{};   ///< what was removed: how much lighter the place became on average, per channel
+  double drift_support = 0;            ///< share of the image that agrees with the drift, 0 … 1
+  std::array<float, 2> movement_px{};  ///< of the body frame against the background frames, to the right and down
 };
 
 /// Finds the drift of gain, white balance and light between the two captures (it may vary slowly over the image)
-/// from the cells that look like background under it, and the noise from how much those scatter.
+/// from the cells that look like background under it, the noise from how much those scatter, and by how much the camera
+/// was moved from the edges of the background.
 Residual compare(const BackgroundModel& background, const CellFrame& body);
 
 }  // namespace booth::segmentation

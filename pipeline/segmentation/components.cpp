@@ -1,6 +1,7 @@
 #include "pipeline/segmentation/components.h"
 
 #include <algorithm>
+#include <cstring>
 
 namespace booth::segmentation {
 namespace {
@@ -22,19 +23,30 @@ Components connected_components(std::span<const uint8_t> values, int width, int 
   std::vector<Components::Run>& runs = parts.runs;
   std::vector<int32_t> parent;
   const int touch = connectivity == Connectivity::eight ? 1 : 0;
-  const auto within = [low, high](uint8_t v) { return v >= low && v <= high; };
+  // 1 where a value is within the range, and something else behind the row's end.
+  std::vector<uint8_t> within(static_cast<size_t>(width) + 1, 2);
+  const auto end_of_stretch = [&within, width](int x) {
+    const uint8_t value = within[x];
+    // Masks are the same for long stretches: those are passed eight at a time.
+    constexpr int at_once = sizeof(uint64_t);
+    const uint64_t same = value * uint64_t{0x0101010101010101};
+    for (uint64_t eight = same; x + at_once <= width; x += at_once) {
+      std::memcpy(&eight, within.data() + x, at_once);
+      if (eight != same) break;
+    }
+    while (within[x] == value) ++x;
+    return x;
+  };
   size_t above_begin = 0, above_end = 0;
   for (int y = 0; y < height; ++y) {
     const uint8_t* row = values.data() + static_cast<size_t>(y) * static_cast<size_t>(width);
     const size_t row_begin = runs.size();
     size_t above = above_begin;
+    for (int x = 0; x < width; ++x) within[x] = row[x] >= low && row[x] <= high ? 1 : 0;
     for (int x = 0; x < width;) {
-      if (!within(row[x])) {
-        ++x;
-        continue;
-      }
-      const int begin = x;
-      while (x < width && within(row[x])) ++x;
+      const int begin = within[x] == 1 ? x : end_of_stretch(x);
+      if (begin == width) break;
+      x = end_of_stretch(begin);
       const auto number = static_cast<int32_t>(runs.size());
       runs.push_back({y, begin, x, 0});
       parent.push_back(number);

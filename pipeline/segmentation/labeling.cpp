@@ -147,8 +147,8 @@ std::vector<float> roughness(const Residual& residual, const CellGrid& grid, con
 /// What it costs to draw a boundary between two neighbouring cells.
 class BoundaryCost {
  public:
-  BoundaryCost(const Residual& residual, double smoothness)
-      : residual_(residual), smoothness_(static_cast<float>(smoothness) * capacity_scale) {}
+  BoundaryCost(const Residual& residual, const CellPlanes& body, double smoothness)
+      : residual_(residual), body_(body), smoothness_(static_cast<float>(smoothness) * capacity_scale) {}
 
   int32_t operator()(size_t a, size_t b, bool diagonal) const {
     // An edge needs to show in the image itself and in its difference to the background: an edge of the
@@ -158,7 +158,7 @@ class BoundaryCost {
     for (int c = 0; c < channels; ++c) {
       const float noise =
           residual_.variance.values[c][a] + residual_.variance.values[c][b] + edge_lightness * edge_lightness;
-      const float in_body = residual_.body.values[c][a] - residual_.body.values[c][b];
+      const float in_body = body_.values[c][a] - body_.values[c][b];
       const float in_difference = residual_.difference.values[c][a] - residual_.difference.values[c][b];
       seen += in_body * in_body / noise;
       new_ += in_difference * in_difference / noise;
@@ -170,14 +170,14 @@ class BoundaryCost {
 
  private:
   const Residual& residual_;
+  const CellPlanes& body_;
   float smoothness_;
 };
 
 /// Settles, patch by patch, what could be a shadow as well as clothes in the background's hue. Patches are bounded by
 /// edges; a shadow's rim towards clear background fades, that of a thing does not. A patch without such a rim lies
 /// inside the subject.
-void judge_patches(const CellGrid& grid, const Residual& residual, std::vector<float>& evidence) {
-  const BoundaryCost cost(residual, 1);
+void judge_patches(const CellGrid& grid, const BoundaryCost& cost, std::vector<float>& evidence) {
   const auto is_edge = [&](size_t a, size_t b) {
     return cost(a, b, false) < static_cast<int32_t>(no_edge * capacity_scale);
   };
@@ -254,7 +254,7 @@ std::vector<Certainty> certain_cells(const std::vector<float>& evidence, const C
   return certain;
 }
 
-CellMask cut(const std::vector<float>& evidence, const Residual& residual, const CellGrid& grid, double smoothness) {
+CellMask cut(const std::vector<float>& evidence, const BoundaryCost& cost, const CellGrid& grid) {
   const std::vector<Certainty> certain = certain_cells(evidence, grid);
   std::vector<int32_t> node_of(grid.count(), -1);
   std::vector<size_t> cell_of;
@@ -263,7 +263,6 @@ CellMask cut(const std::vector<float>& evidence, const Residual& residual, const
     node_of[i] = static_cast<int32_t>(cell_of.size());
     cell_of.push_back(i);
   }
-  const BoundaryCost cost(residual, smoothness);
   CutGraph graph;
   graph.nodes.resize(cell_of.size());
   for (size_t n = 0; n < cell_of.size(); ++n) {
@@ -316,13 +315,12 @@ double remove_specks(CellMask& mask, const CellGrid& grid, double smallest_part)
 /// A hole through which one sees the background has a rim that shows as an edge. One without is a piece of the
 /// subject that happens to look like the background behind it.
 void fill_false_holes(CellMask& mask, const CellGrid& grid, const std::vector<float>& evidence,
-                      const Residual& residual) {
+                      const BoundaryCost& cost) {
   const Components gaps = connected_components(mask, grid.width, grid.height, 0, 0, Connectivity::four);
   const std::vector<int32_t> gap_of = part_raster(gaps, grid.width, grid.height);
   const size_t n = gaps.areas.size();
   std::vector<uint8_t> open(n, 0);
   std::vector<double> rim(n, 0), price(n, 0), looks(n, 0);
-  const BoundaryCost cost(residual, 1);
   for (int y = 0; y < grid.height; ++y) {
     for (int x = 0; x < grid.width; ++x) {
       const int32_t gap = gap_of[grid.index(x, y)];
@@ -353,7 +351,8 @@ void fill_false_holes(CellMask& mask, const CellGrid& grid, const std::vector<fl
 
 }  // namespace
 
-Labeling label_cells(const CellGrid& grid, const Residual& residual, const LabelingOptions& options) {
+Labeling label_cells(const CellGrid& grid, const Residual& residual, const CellPlanes& body,
+                     const LabelingOptions& options) {
   const Evidence evidence_of(residual, options);
   std::vector<float> evidence(grid.count());
   for (size_t i = 0; i < evidence.size(); ++i) evidence[i] = evidence_of(i);
@@ -363,12 +362,13 @@ Labeling label_cells(const CellGrid& grid, const Residual& residual, const Label
     evidence[i] = std::min(evidence[i] + std::min(texture, largest_roughness_evidence), largest_evidence);
   }
 
-  judge_patches(grid, residual, evidence);
+  const BoundaryCost plain_cost(residual, body, 1);
+  judge_patches(grid, plain_cost, evidence);
 
   Labeling labeling;
-  labeling.subject = cut(evidence, residual, grid, options.smoothness);
+  labeling.subject = cut(evidence, BoundaryCost(residual, body, options.smoothness), grid);
   labeling.second_part = remove_specks(labeling.subject, grid, options.smallest_part);
-  fill_false_holes(labeling.subject, grid, evidence, residual);
+  fill_false_holes(labeling.subject, grid, evidence, plain_cost);
   std::vector<float> of_subject;
   for (size_t i = 0; i < evidence.size(); ++i) {
     if (labeling.subject[i] != 0) of_subject.push_back(evidence[i]);

@@ -30,6 +30,8 @@ struct Labeling {
 /// Source: J. Sun, W. Zhang, X. Tang, H.-Y. Shum, "Background Cut", ECCV 2006 (contrast attenuated by the
 /// background's); shadows as a loss of lightness that keeps chromaticity and texture: T. Horprasert, D. Harwood,
 /// L. S. Davis, "A statistical approach for real-time robust background subtraction and shadow detection", 1999.
-Labeling label_cells(const CellGrid& grid, const Residual& residual, const LabelingOptions& options);
+/// @param body  the body frame's lightness
+Labeling label_cells(const CellGrid& grid, const Residual& residual, const CellPlanes& body,
+                     const LabelingOptions& options);
 
 }  // namespace booth::segmentation

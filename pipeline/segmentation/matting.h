@@ -17,7 +17,7 @@ namespace booth::segmentation {
 /// in sRGB the outline of a dark subject before a bright wall would move outwards by a quarter of its blur.
 /// Where F and B hardly differ the outline known before takes over; pixels of a colour that neither has, such as
 /// highlights along the rim, are subject.
-Image matte(std::span<const Frame> background, const Image& body, const CellGrid& grid, const Residual& residual,
-            const CellMask& subject);
+Image matte(std::span<const Frame> background, const Image& body, const BackgroundModel& model,
+            const Residual& residual, const CellMask& subject);
 
 }  // namespace booth::segmentation

@@ -21,6 +21,20 @@ constexpr double little_agreement = 0.25;  ///< share of the image that still lo
 constexpr double large_second_part = 0.2;  ///< see Labeling::second_part
 constexpr double little_contrast = 0.3;    ///< see Labeling::contrast
 
+/// What is left of a camera's movement is undone to first order when smaller than this; the background is moved by
+/// whole pixels and looked at anew when larger.
+constexpr float small_movement_px = 0.6F;
+constexpr int most_realignments = 3;
+constexpr float largest_movement_px = 12;  ///< more is no camera that was touched but one that looks elsewhere
+constexpr float much_movement_px = 0.75F;  ///< the calibration suffers
+
+bool is_misaligned(const BackgroundModel& model, const Residual& residual) {
+  const float x = residual.movement_px[0], y = residual.movement_px[1];
+  return std::hypot(x, y) <= largest_movement_px &&
+         std::max(std::abs(x - static_cast<float>(model.offset.x)), std::abs(y - static_cast<float>(model.offset.y))) >
+             small_movement_px;
+}
+
 Result<void> check(const SegmentationOptions& options) {
   const auto in = [](double value, double low, double high) { return value >= low && value <= high; };
   std::ostringstream message;
@@ -103,6 +117,13 @@ std::vector<std::string> find_warnings(const Residual& residual, const Labeling&
     text << "the light changed by a factor of " << drift << " since the background was captured";
     warn(text.str());
   }
+  const float movement_px = std::hypot(residual.movement_px[0], residual.movement_px[1]);
+  if (movement_px > much_movement_px) {
+    std::ostringstream text;
+    text.precision(2);
+    text << "the camera moved by " << movement_px << " pixels since the background was captured; calibrate it anew";
+    warn(text.str());
+  }
   if (residual.drift_support < little_agreement) warn("little of the image still looks like the background");
   if (labeling.contrast < little_contrast) warn("the subject hardly differs from the background");
   if (labeling.second_part > large_second_part) warn("something else than the subject seems to be in view");
@@ -118,12 +139,19 @@ Result<Segmentation> segment(std::span<const Frame> background, const Frame& bod
   if (Result<void> ok = check(options); !ok) return ok.error();
   if (Result<void> ok = check(background, body); !ok) return ok.error();
 
-  const BackgroundModel model = segmentation::learn_background(background);
-  const Residual residual = segmentation::compare(model, segmentation::average_cells(*body.pixels, model.grid));
+  BackgroundModel model = segmentation::learn_background(background);
+  const segmentation::CellFrame cells = segmentation::average_cells(*body.pixels, model.grid);
+  Residual residual = segmentation::compare(model, cells);
+  for (int n = 0; n < most_realignments && is_misaligned(model, residual); ++n) {
+    const auto whole = [](float px) { return static_cast<int>(std::lround(px)); };
+    model =
+        segmentation::learn_background(background, {whole(residual.movement_px[0]), whole(residual.movement_px[1])});
+    residual = segmentation::compare(model, cells);
+  }
   if (work.stopped()) return Work::cancelled();
   work.report(0.5);
 
-  const Labeling labeling = segmentation::label_cells(model.grid, residual,
+  const Labeling labeling = segmentation::label_cells(model.grid, residual, cells.lightness,
                                                       {.darkest_shadow = options.darkest_shadow,
                                                        .smoothness = options.smoothness,
                                                        .smallest_part = options.smallest_part});
@@ -136,7 +164,7 @@ Result<Segmentation> segment(std::span<const Frame> background, const Frame& bod
 
   Segmentation result;
   result.silhouette.camera = body.camera;
-  result.silhouette.coverage = segmentation::matte(background, *body.pixels, model.grid, residual, labeling.subject);
+  result.silhouette.coverage = segmentation::matte(background, *body.pixels, model, residual, labeling.subject);
   result.subject_share = covered_share(result.silhouette.coverage);
   result.warnings = find_warnings(residual, labeling, result, body.camera);
   work.report(1);
