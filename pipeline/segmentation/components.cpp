@@ -73,13 +73,4 @@ Components connected_components(std::span<const uint8_t> values, int width, int 
   return parts;
 }
 
-std::vector<int32_t> part_raster(const Components& components, int width, int height) {
-  std::vector<int32_t> raster(static_cast<size_t>(width) * static_cast<size_t>(height), -1);
-  for (const Components::Run& run : components.runs) {
-    int32_t* row = raster.data() + static_cast<size_t>(run.row) * static_cast<size_t>(width);
-    std::fill(row + run.begin, row + run.end, run.part);
-  }
-  return raster;
-}
-
 }  // namespace booth::segmentation

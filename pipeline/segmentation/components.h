@@ -23,7 +23,4 @@ struct Components {
 Components connected_components(std::span<const uint8_t> values, int width, int height, uint8_t low, uint8_t high,
                                 Connectivity connectivity);
 
-/// A cell's part, or −1 for cells of other values, row by row.
-std::vector<int32_t> part_raster(const Components& components, int width, int height);
-
 }  // namespace booth::segmentation

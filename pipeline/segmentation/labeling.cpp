@@ -49,30 +49,33 @@ constexpr float edge_lightness = 0.04F;
 /// Integer capacities per nat.
 constexpr float capacity_scale = 256;
 
-/// Evidence for subject (positive) or background (negative) of one cell.
+/// Evidence for subject (positive) or background (negative) by cell.
 class Evidence {
  public:
-  Evidence(const Residual& residual, const LabelingOptions& options)
-      : residual_(residual),
-        deepest_(-std::log(static_cast<float>(options.darkest_shadow)) / srgb_exponent),
-        colored_(residual.difference.channels == 3) {}
+  explicit Evidence(const LabelingOptions& options)
+      : deepest_(-std::log(static_cast<float>(options.darkest_shadow)) / srgb_exponent) {}
 
-  float operator()(size_t i) const {
-    const auto& d = residual_.difference.values;
-    const auto& v = residual_.variance.values;
-    float lightness = d[0][i];
-    float variance = v[0][i];
-    float unlikeness = 0;
-    if (colored_) {
-      lightness = (d[0][i] + d[1][i] + d[2][i]) / 3;
-      variance = (v[0][i] + v[1][i] + v[2][i]) / 9;
-      const float shadow = tint_in_shadow * std::clamp(-lightness, 0.0F, deepest_);
+  std::vector<float> operator()(const Residual& residual) const {
+    const auto& d = residual.difference.values;
+    const auto& v = residual.variance.values;
+    std::vector<float> evidence(d[0].size());
+    if (residual.difference.channels == 1) {
+      for (size_t i = 0; i < evidence.size(); ++i)
+        evidence[i] = std::min(of_lightness(d[0][i], v[0][i]), largest_evidence);
+      return evidence;
+    }
+    for (size_t i = 0; i < evidence.size(); ++i) {
+      const float lightness = (d[0][i] + d[1][i] + d[2][i]) * (1.0F / 3);
+      const float variance = (v[0][i] + v[1][i] + v[2][i]) * (1.0F / 9);
+      const float shadow = tint_in_shadow * std::min(std::max(-lightness, 0.0F), deepest_);
       const float slack = tint * tint + shadow * shadow;
       const float red = d[0][i] - d[1][i];
       const float blue = d[2][i] - d[1][i];
-      unlikeness = 0.5F * (red * red / (v[0][i] + v[1][i] + slack) + blue * blue / (v[2][i] + v[1][i] + slack));
+      const float unlikeness =
+          0.5F * (red * red / (v[0][i] + v[1][i] + slack) + blue * blue / (v[2][i] + v[1][i] + slack));
+      evidence[i] = std::min(unlikeness + of_lightness(lightness, variance), largest_evidence);
     }
-    return std::min(unlikeness + of_lightness(lightness, variance), largest_evidence);
+    return evidence;
   }
 
  private:
@@ -82,13 +85,12 @@ class Evidence {
     const float spread = variance + 0.25F * unnoticed_change * unnoticed_change;
     const float rising = std::min(0.5F * noticed * noticed / spread - background_evidence, shadow_evidence);
     // Beyond the deepest shadow or the brightest glow the evidence rises again.
-    const float beyond = std::max(0.0F, change / (lightness < 0 ? deepest_ : brightest_glow) - 1);
+    const float limit = lightness < 0 ? 1 / deepest_ : 1 / brightest_glow;
+    const float beyond = std::max(0.0F, change * limit - 1);
     return rising + 2 * background_evidence * beyond;
   }
 
-  const Residual& residual_;
   float deepest_;
-  bool colored_;
 };
 
 /// How much rougher than noise a cell's surroundings are in the difference to the background, 1 for noise alone.
@@ -151,6 +153,12 @@ class BoundaryCost {
       : residual_(residual), body_(body), smoothness_(static_cast<float>(smoothness) * capacity_scale) {}
 
   int32_t operator()(size_t a, size_t b, bool diagonal) const {
+    const float distance = diagonal ? 0.70710678F : 1.0F;
+    return static_cast<int32_t>(smoothness_ * distance * std::exp(-0.5F * edge(a, b))) + 1;
+  }
+
+  /// How clearly an edge runs between two neighbours, as an exponent of the cost: 0 in flat colour.
+  float edge(size_t a, size_t b) const {
     // An edge needs to show in the image itself and in its difference to the background: an edge of the
     // background alone is no boundary of the subject, nor is one that the background shows as well.
     float seen = 0, new_ = 0;
@@ -163,9 +171,7 @@ class BoundaryCost {
       seen += in_body * in_body / noise;
       new_ += in_difference * in_difference / noise;
     }
-    const float edge = std::min(seen, new_) / static_cast<float>(channels);
-    const float distance = diagonal ? 0.70710678F : 1.0F;
-    return static_cast<int32_t>(smoothness_ * distance * std::exp(-0.5F * edge)) + 1;
+    return std::min(seen, new_) / static_cast<float>(channels);
   }
 
  private:
@@ -178,9 +184,8 @@ class BoundaryCost {
 /// edges; a shadow's rim towards clear background fades, that of a thing does not. A patch without such a rim lies
 /// inside the subject.
 void judge_patches(const CellGrid& grid, const BoundaryCost& cost, std::vector<float>& evidence) {
-  const auto is_edge = [&](size_t a, size_t b) {
-    return cost(a, b, false) < static_cast<int32_t>(no_edge * capacity_scale);
-  };
+  const float least_edge = -2 * std::log(no_edge);
+  const auto is_edge = [&](size_t a, size_t b) { return cost.edge(a, b) > least_edge; };
   std::vector<float> verdict(grid.count(), 0);
   CellMask visited(evidence.size(), 0);
   std::vector<size_t> members;
@@ -217,29 +222,29 @@ void judge_patches(const CellGrid& grid, const BoundaryCost& cost, std::vector<f
 enum class Certainty : uint8_t { open, subject, background };
 
 std::vector<Certainty> certain_cells(const std::vector<float>& evidence, const CellGrid& grid) {
-  // Runs of equal clear cells that reach so far both ways, first along rows, then along columns, row by row.
+  // Runs of equal clear cells that reach so far both ways, first along rows, then along columns. The image's border
+  // agrees with whatever is beside it.
   constexpr int reach = 2;
   constexpr float clear_background = -2;
-  const auto certainty = [&](float e) {
+  std::vector<Certainty> clear(grid.count());
+  std::transform(evidence.begin(), evidence.end(), clear.begin(), [](float e) {
     return e > clear_subject ? Certainty::subject : e < clear_background ? Certainty::background : Certainty::open;
-  };
-  std::vector<Certainty> rows(evidence.size(), Certainty::open), certain(evidence.size(), Certainty::open);
-  std::vector<Certainty> clear(static_cast<size_t>(grid.width + 2 * reach));
+  });
+  const auto agree = [](Certainty here, bool same) { return same ? here : Certainty::open; };
+  std::vector<Certainty> rows(grid.count());
   for (int y = 0; y < grid.height; ++y) {
-    const float* e = evidence.data() + grid.index(0, y);
-    for (int x = 0; x < grid.width; ++x) clear[x + reach] = certainty(e[x]);
-    // The image's border agrees with whatever is beside it.
-    for (int x = 0; x < reach; ++x) {
-      clear[x] = clear[reach];
-      clear[grid.width + reach + x] = clear[grid.width + reach - 1];
-    }
+    const Certainty* in = clear.data() + grid.index(0, y);
     Certainty* out = rows.data() + grid.index(0, y);
+    for (int x = reach; x + reach < grid.width; ++x)
+      out[x] = agree(in[x], in[x - 2] == in[x] && in[x - 1] == in[x] && in[x + 1] == in[x] && in[x + 2] == in[x]);
     for (int x = 0; x < grid.width; ++x) {
-      const bool same = clear[x] == clear[x + 2] && clear[x + 1] == clear[x + 2] && clear[x + 3] == clear[x + 2] &&
-                        clear[x + 4] == clear[x + 2];
-      out[x] = same ? clear[x + 2] : Certainty::open;
+      if (x == reach) x = std::max(x, grid.width - reach);
+      bool same = true;
+      for (int d = -reach; d <= reach; ++d) same = same && in[std::clamp(x + d, 0, grid.width - 1)] == in[x];
+      out[x] = agree(in[x], same);
     }
   }
+  std::vector<Certainty>& certain = clear;
   for (int y = 0; y < grid.height; ++y) {
     std::array<const Certainty*, 2 * reach + 1> at{};
     for (int d = -reach; d <= reach; ++d)
@@ -247,11 +252,10 @@ std::vector<Certainty> certain_cells(const std::vector<float>& evidence, const C
     Certainty* out = certain.data() + grid.index(0, y);
     for (int x = 0; x < grid.width; ++x) {
       const Certainty here = at[reach][x];
-      const bool same = at[0][x] == here && at[1][x] == here && at[3][x] == here && at[4][x] == here;
-      out[x] = same ? here : Certainty::open;
+      out[x] = agree(here, at[0][x] == here && at[1][x] == here && at[3][x] == here && at[4][x] == here);
     }
   }
-  return certain;
+  return clear;
 }
 
 CellMask cut(const std::vector<float>& evidence, const BoundaryCost& cost, const CellGrid& grid) {
@@ -317,22 +321,24 @@ double remove_specks(CellMask& mask, const CellGrid& grid, double smallest_part)
 void fill_false_holes(CellMask& mask, const CellGrid& grid, const std::vector<float>& evidence,
                       const BoundaryCost& cost) {
   const Components gaps = connected_components(mask, grid.width, grid.height, 0, 0, Connectivity::four);
-  const std::vector<int32_t> gap_of = part_raster(gaps, grid.width, grid.height);
-  const size_t n = gaps.areas.size();
-  std::vector<uint8_t> open(n, 0);
-  std::vector<double> rim(n, 0), price(n, 0), looks(n, 0);
-  for (int y = 0; y < grid.height; ++y) {
-    for (int x = 0; x < grid.width; ++x) {
-      const int32_t gap = gap_of[grid.index(x, y)];
-      if (gap < 0) continue;
-      if (x == 0 || y == 0 || x == grid.width - 1 || y == grid.height - 1) open[gap] = 1;
-      looks[gap] += evidence[grid.index(x, y)];
+  struct Gap {
+    bool open = false;  ///< reaches the border
+    double rim = 0, price = 0, looks = 0;
+  };
+  std::vector<Gap> of(gaps.areas.size());
+  for (const Components::Run& run : gaps.runs)
+    if (run.row == 0 || run.row == grid.height - 1 || run.begin == 0 || run.end == grid.width) of[run.part].open = true;
+  for (const Components::Run& run : gaps.runs) {
+    Gap& gap = of[run.part];
+    if (gap.open) continue;
+    for (int x = run.begin; x < run.end; ++x) {
+      const size_t cell = grid.index(x, run.row);
+      gap.looks += evidence[cell];
       for (const int k : {1, 3, 4, 6}) {
-        const int nx = x + neighbor_steps[k][0];
-        const int ny = y + neighbor_steps[k][1];
-        if (!grid.contains(nx, ny) || mask[grid.index(nx, ny)] == 0) continue;
-        rim[gap] += 1;
-        price[gap] += cost(grid.index(x, y), grid.index(nx, ny), false) / static_cast<double>(capacity_scale);
+        const size_t other = grid.index(x + neighbor_steps[k][0], run.row + neighbor_steps[k][1]);
+        if (mask[other] == 0) continue;
+        gap.rim += 1;
+        gap.price += cost(cell, other, false) / static_cast<double>(capacity_scale);
       }
     }
   }
@@ -340,12 +346,15 @@ void fill_false_holes(CellMask& mask, const CellGrid& grid, const std::vector<fl
   // few cells must on top look like background on average, as noise inside dark clothes does not.
   constexpr double faint_rim = 0.6;
   constexpr size_t few_cells = 12;
-  for (size_t i = 0; i < mask.size(); ++i) {
-    const int32_t gap = gap_of[i];
-    if (gap < 0 || open[gap] != 0) continue;
-    const bool faint = price[gap] > faint_rim * rim[gap];
-    const bool doubtful = gaps.areas[gap] < few_cells && looks[gap] > -0.5 * static_cast<double>(gaps.areas[gap]);
-    if (faint || doubtful) mask[i] = 1;
+  for (const Components::Run& run : gaps.runs) {
+    const Gap& gap = of[run.part];
+    if (gap.open) continue;
+    const size_t area = gaps.areas[run.part];
+    const bool faint = gap.price > faint_rim * gap.rim;
+    const bool doubtful = area < few_cells && gap.looks > -0.5 * static_cast<double>(area);
+    if (faint || doubtful)
+      std::fill(mask.begin() + static_cast<long>(grid.index(run.begin, run.row)),
+                mask.begin() + static_cast<long>(grid.index(run.end, run.row)), uint8_t{1});
   }
 }
 
@@ -353,9 +362,7 @@ void fill_false_holes(CellMask& mask, const CellGrid& grid, const std::vector<fl
 
 Labeling label_cells(const CellGrid& grid, const Residual& residual, const CellPlanes& body,
                      const LabelingOptions& options) {
-  const Evidence evidence_of(residual, options);
-  std::vector<float> evidence(grid.count());
-  for (size_t i = 0; i < evidence.size(); ++i) evidence[i] = evidence_of(i);
+  std::vector<float> evidence = Evidence(options)(residual);
   const std::vector<float> rough = roughness(residual, grid, evidence);
   for (size_t i = 0; i < evidence.size(); ++i) {
     const float texture = roughness_evidence * std::max(0.0F, rough[i] - noisy_roughness);

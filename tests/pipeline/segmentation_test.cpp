@@ -550,9 +550,11 @@ TEST(ConnectedComponents, FollowsTheNeighborhoodAskedFor) {
   EXPECT_EQ(four.areas, (std::vector<size_t>{1, 6, 1, 2}));
   const auto gaps = segmentation::connected_components(mask, 5, 4, 0, 0, segmentation::Connectivity::four);
   EXPECT_EQ(gaps.areas, (std::vector<size_t>{9, 1}));
-  const std::vector<int32_t> raster = segmentation::part_raster(gaps, 5, 4);
-  EXPECT_EQ(raster[19], 1);
-  EXPECT_EQ(raster[0], -1);
+  ASSERT_FALSE(gaps.runs.empty());
+  EXPECT_EQ(gaps.runs.back().row, 3);
+  EXPECT_EQ(gaps.runs.back().begin, 4);
+  EXPECT_EQ(gaps.runs.back().end, 5);
+  EXPECT_EQ(gaps.runs.back().part, 1);
 }
 
 }  // namespace
