@@ -111,6 +111,16 @@ void visit_reconstruct(Visitor& visitor, ReconstructionOptions& options) {
 }
 
 template <class Visitor>
+void visit_export(Visitor& visitor, AvatarFileOptions& files) {
+  visitor.choice("texture", files.texture, Words<ImageFormat>{{"png", ImageFormat::png}, {"jpeg", ImageFormat::jpeg}});
+  visitor.integer("jpeg_quality", files.jpeg_quality, 1, 100);
+  visitor.boolean("animation", files.animation);
+  visitor.boolean("turntable", files.turntable);
+  visitor.choices("formats", files.formats,
+                  Words<MeshFormat>{{"stl", MeshFormat::stl}, {"obj", MeshFormat::obj}, {"ply", MeshFormat::ply}});
+}
+
+template <class Visitor>
 void visit_config(Visitor& visitor, BoothConfig& config) {
   visitor.section("booth", [&](auto& section) { visit_booth(section, config.booth); });
   visitor.section("api", [&](auto& section) { visit_api(section, config.api); });
@@ -121,6 +131,7 @@ void visit_config(Visitor& visitor, BoothConfig& config) {
   visitor.section("drivers", [&](auto& section) { visit_drivers(section, config.drivers); });
   visitor.section("replay", [&](auto& section) { visit_replay(section, config.replay); });
   visitor.section("reconstruct", [&](auto& section) { visit_reconstruct(section, config.reconstruct); });
+  visitor.section("export", [&](auto& section) { visit_export(section, config.files); });
 }
 
 /// One short line without control characters.
@@ -275,6 +286,27 @@ class Reader {
     value = found->second;
   }
 
+  /// A list of words, each at most once.
+  template <class Value>
+  void choices(const char* key, std::vector<Value>& values, const Words<Value>& words) {
+    const toml::node* node = take(key);
+    if (node == nullptr) return;
+    const toml::array* array = node->as_array();
+    if (array == nullptr) return refuse(key, *node, "an array of words, each " + listed(words));
+    values.clear();
+    for (size_t i = 0; i < array->size(); ++i) {
+      const std::string path = std::string(key) + "[" + std::to_string(i) + "]";
+      const auto text = (*array)[i].value_exact<std::string>();
+      const auto found = std::find_if(words.begin(), words.end(), [&](const auto& word) { return text == word.first; });
+      if (found == words.end())
+        refuse(path.c_str(), (*array)[i], listed(words));
+      else if (std::find(values.begin(), values.end(), found->second) != values.end())
+        refuse(path.c_str(), (*array)[i], "each word once");
+      else
+        values.push_back(found->second);
+    }
+  }
+
   /// Reports the keys that nobody asked for.
   void refuse_unknown() {
     std::string list;
@@ -347,6 +379,14 @@ class Writer {
     for (const auto& [word, meaning] : words)
       if (meaning == value) write_text(key, std::string(word));
   }
+  template <class Value>
+  void choices(const char* key, const std::vector<Value>& values, const Words<Value>& words) {
+    text_ << key << " = [";
+    for (size_t i = 0; i < values.size(); ++i)
+      for (const auto& [word, meaning] : words)
+        if (meaning == values[i]) text_ << (i > 0 ? ", " : "") << toml::value<std::string>(std::string(word));
+    text_ << "]\n";
+  }
 
   std::string text() const { return text_.str(); }
 
@@ -388,6 +428,10 @@ class Lister {
   void millimetres(const char* key, double, double, double) { add(key); }
   template <class Value>
   void choice(const char* key, const Value&, const Words<Value>&) {
+    add(key);
+  }
+  template <class Value>
+  void choices(const char* key, const std::vector<Value>&, const Words<Value>&) {
     add(key);
   }
 

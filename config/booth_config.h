@@ -5,6 +5,7 @@
 #include <string_view>
 #include <vector>
 
+#include "pipeline/export/avatar_files.h"
 #include "pipeline/reconstruct.h"
 #include "pipeline/types/result.h"
 #include "replay/recording_writer.h"
@@ -67,6 +68,7 @@ struct BoothConfig {
   DriversConfig drivers;
   ReplayOptions replay;
   ReconstructionOptions reconstruct;
+  AvatarFileOptions files;  ///< section [export]
 };
 
 /// One thing wrong with a configuration: `path: value, expected …`.

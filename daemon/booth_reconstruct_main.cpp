@@ -126,7 +126,7 @@ int run(const Arguments& arguments) {
   work.stop = stop.token();
   ProgressBar bar;
   const bool draw = isatty(STDERR_FILENO) != 0 && arguments.progress_fd < 0;
-  const auto made = reconstruct_recording(arguments.recording, arguments.avatar, options, work,
+  const auto made = reconstruct_recording(arguments.recording, arguments.avatar, options, config.files, work,
                                           [&](std::string_view stage, double fraction) {
                                             if (draw) bar.draw(stage, fraction);
                                             pipe.tell({{"stage", stage}, {"fraction", fraction}});

@@ -125,7 +125,7 @@ const std::vector<std::string>& job_stages() {
 
 Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_folder,
                                         const std::filesystem::path& avatar, const ReconstructionOptions& options,
-                                        const Work& work, const JobProgress& progress) {
+                                        const AvatarFileOptions& files, const Work& work, const JobProgress& progress) {
   // A trailing slash names the same folder.
   const std::filesystem::path target = avatar.has_filename() ? avatar : avatar.parent_path();
   const std::filesystem::path parent = target.has_parent_path() ? target.parent_path() : ".";
@@ -158,7 +158,7 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   metadata.warnings = report.warnings;
   metadata.stage_seconds = clock.finish();
   clock.tell("export", 0);
-  for (const NamedBytes& file : make_avatar_files(made->avatar, std::move(metadata), {}, work))
+  for (const NamedBytes& file : make_avatar_files(made->avatar, std::move(metadata), files, work))
     if (const auto written = folder->write(file.name, file.bytes); !written) return written.error();
   if (work.stopped()) return Work::cancelled();
   if (*replaces)

@@ -1,18 +1,44 @@
 #include "pipeline/export/avatar_files.h"
 
-#include <array>
+#include <algorithm>
 #include <functional>
+#include <string>
 #include <utility>
 
+#include "pipeline/export/animation.h"
 #include "pipeline/export/collada.h"
 #include "pipeline/export/gltf.h"
 #include "pipeline/export/sha256.h"
-#include "pipeline/image/codec.h"
+#include "pipeline/image/webp.h"
 
 namespace booth {
 namespace {
 
 std::vector<uint8_t> to_bytes(const std::string& text) { return {text.begin(), text.end()}; }
+
+/// A file and how it is made.
+struct PlannedFile {
+  std::string name;
+  std::function<std::vector<uint8_t>()> make;
+};
+
+std::vector<uint8_t> make_turntable(const Avatar& avatar, const TurntableOptions& options) {
+  constexpr int quality = 80;
+  const std::vector<Image> frames = render_turntable(avatar, options);
+  return encode_webp_animation(frames, options.seconds / static_cast<double>(frames.size()), quality);
+}
+
+void plan_mesh_files(const Avatar& avatar, const std::vector<MeshFormat>& formats, const std::string& texture,
+                     std::vector<PlannedFile>& plan) {
+  for (const MeshFormat format : formats) switch (format) {
+      case MeshFormat::stl: plan.push_back({"avatar.stl", [&] { return write_stl(avatar); }}); break;
+      case MeshFormat::ply: plan.push_back({"avatar.ply", [&] { return write_ply(avatar); }}); break;
+      case MeshFormat::obj:
+        plan.push_back({"avatar.obj", [&] { return to_bytes(write_obj(avatar, "avatar.mtl")); }});
+        plan.push_back({"avatar.mtl", [&] { return to_bytes(write_obj_material(texture)); }});
+        break;
+    }
+}
 
 }  // namespace
 
@@ -21,22 +47,32 @@ std::vector<NamedBytes> make_avatar_files(const Avatar& avatar, AvatarMetadata m
   metadata.triangles = avatar.mesh.triangles.size();
   metadata.joints = avatar.skeleton.joints.size();
   const std::string tool = "Avatar Booth " + metadata.software_version;
-  ColladaOptions collada{.texture_file = "texture.png", .created = metadata.created, .authoring_tool = tool};
+  const bool as_png = options.texture == ImageFormat::png;
+  const std::string texture = as_png ? "texture.png" : "texture.jpg";
+  std::vector<AnimationClip> clips;
+  if (options.animation) clips = make_clips(avatar.skeleton);
 
-  NamedBytes dae{"avatar.dae", {}}, texture{collada.texture_file, {}}, glb{"avatar.glb", {}},
-      preview{"preview.png", {}};
   // The longest first, so that the others fill the remaining threads.
-  const std::array<std::function<void()>, 3> independent{
-      [&] { texture.bytes = encode_png(avatar.atlas.image, options.texture_png_level); },
-      [&] { preview.bytes = encode_png(render_portrait(avatar, options.portrait)); },
-      [&] { dae.bytes = to_bytes(write_collada(avatar, collada)); }};
-  work.parallel_for(independent.size(), 1, [&](size_t begin, size_t end) {
-    for (size_t i = begin; i < end; ++i) independent[i]();
-  });
-  glb.bytes = write_glb(avatar, texture.bytes, {.generator = tool});
+  std::vector<PlannedFile> plan;
+  if (options.turntable) plan.push_back({"turntable.webp", [&] { return make_turntable(avatar, options.turning); }});
+  const size_t texture_at = plan.size();
+  plan.push_back({texture, [&] {
+                    return as_png ? encode_png(avatar.atlas.image, options.texture_png_level)
+                                  : encode_jpeg(avatar.atlas.image, options.jpeg_quality);
+                  }});
+  plan.push_back({"preview.png", [&] { return encode_png(render_portrait(avatar, options.portrait)); }});
+  plan.push_back({"avatar.dae", [&] {
+                    return to_bytes(write_collada(
+                        avatar, clips, {.texture_file = texture, .created = metadata.created, .authoring_tool = tool}));
+                  }});
+  plan_mesh_files(avatar, options.formats, texture, plan);
 
-  std::vector<NamedBytes> files;
-  for (NamedBytes* file : {&dae, &texture, &glb, &preview}) files.push_back(std::move(*file));
+  std::vector<NamedBytes> files(plan.size());
+  work.parallel_for(plan.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; ++i) files[i] = {plan[i].name, plan[i].make()};
+  });
+  files.push_back({"avatar.glb", write_glb(avatar, clips, files[texture_at].bytes,
+                                           {.generator = tool, .texture_format = options.texture})});
   metadata.files.resize(files.size());
   work.parallel_for(files.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end; ++i)

@@ -4,8 +4,10 @@
 #include <string>
 #include <vector>
 
+#include "pipeline/export/mesh_files.h"
 #include "pipeline/export/metadata.h"
 #include "pipeline/export/portrait.h"
+#include "pipeline/image/codec.h"
 #include "pipeline/types/avatar.h"
 #include "pipeline/types/work.h"
 
@@ -17,12 +19,18 @@ struct NamedBytes {
 };
 
 struct AvatarFileOptions {
-  int texture_png_level = 4;  ///< zlib's, 0 … 9: larger makes smaller files, slower
+  ImageFormat texture = ImageFormat::png;  ///< of the atlas: texture.png, or texture.jpg, a fraction of its size
+  int texture_png_level = 4;               ///< zlib's, 0 … 9: larger makes smaller files, slower
+  int jpeg_quality = 92;                   ///< 1 … 100
+  bool animation = false;                  ///< two clips in avatar.dae and avatar.glb, see make_clips
+  bool turntable = false;                  ///< turntable.webp besides
+  std::vector<MeshFormat> formats;         ///< avatar.stl, avatar.obj with avatar.mtl, avatar.ply besides
   PortraitOptions portrait;
+  TurntableOptions turning;
 };
 
-/// The files of an avatar's folder, ready to be written: avatar.dae, texture.png, avatar.glb, preview.png and, last,
-/// metadata.json.
+/// The files of an avatar's folder, ready to be written: avatar.dae, texture.png or .jpg, avatar.glb, preview.png, what
+/// else the options ask for and, last, metadata.json.
 ///
 /// @param metadata  its triangles, joints and files are filled in here; the rest goes into metadata.json as it is
 /// @pre check(avatar) holds

@@ -2,45 +2,18 @@
 
 #include <algorithm>
 #include <array>
-#include <charconv>
 #include <cmath>
 #include <cstdint>
 #include <set>
 #include <string_view>
 #include <vector>
 
+#include "pipeline/export/number_text.h"
 #include "pipeline/export/seam_vertices.h"
 #include "pipeline/export/skin_tables.h"
 
 namespace booth {
 namespace {
-
-/// Text that grows. Numbers are written by std::to_chars: the shortest that reads back equal, in every locale.
-class Text {
- public:
-  Text& operator<<(std::string_view text) {
-    text_ += text;
-    return *this;
-  }
-  Text& operator<<(char character) {
-    text_ += character;
-    return *this;
-  }
-  template <class Number>
-  requires std::is_arithmetic_v<Number> Text& operator<<(Number number) {
-    std::array<char, 32> digits;                                          // the longest double has 24
-    if constexpr (std::is_floating_point_v<Number>) number += Number{0};  // −0 becomes 0
-    const auto [end, fault] = std::to_chars(digits.data(), digits.data() + digits.size(), number);
-    static_cast<void>(fault);  // too little room, the only fault there is, cannot be
-    text_.append(digits.data(), static_cast<size_t>(end - digits.data()));
-    return *this;
-  }
-  void reserve(size_t size) { text_.reserve(size); }
-  std::string take() { return std::move(text_); }
-
- private:
-  std::string text_;
-};
 
 /// Text for an element or a quoted attribute. Control characters, which XML 1.0 cannot hold, become U+FFFD.
 std::string escaped(std::string_view text) {
@@ -116,7 +89,8 @@ float rounded_normal(float component) {
 
 /// `<source>` of `count` numbers, `params` of them an item, named by letters: "XYZ".
 template <class WriteNumbers>
-void write_source(Text& out, std::string_view id, size_t items, std::string_view params, const WriteNumbers& numbers) {
+void write_source(NumberText& out, std::string_view id, size_t items, std::string_view params,
+                  const WriteNumbers& numbers) {
   out << "      <source id=\"" << id << "\">\n        <float_array id=\"" << id << "-array\" count=\""
       << items * params.size() << "\">";
   numbers();
@@ -126,7 +100,7 @@ void write_source(Text& out, std::string_view id, size_t items, std::string_view
   out << "</accessor></technique_common>\n      </source>\n";
 }
 
-void write_header(Text& out, const ColladaOptions& options) {
+void write_header(NumberText& out, const ColladaOptions& options) {
   out << R"(<?xml version="1.0" encoding="utf-8"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
   <asset>
@@ -140,7 +114,7 @@ void write_header(Text& out, const ColladaOptions& options) {
 }
 
 /// Image, effect and material: matt, in the colours of the texture.
-void write_material(Text& out, const ColladaOptions& options) {
+void write_material(NumberText& out, const ColladaOptions& options) {
   out << "  <library_images>\n    <image id=\"" << image_id << "\" name=\"" << image_id << "\"><init_from>"
       << to_uri(options.texture_file) << "</init_from></image>\n  </library_images>\n";
   out << "  <library_effects>\n    <effect id=\"" << effect_id << "\">\n      <profile_COMMON>\n"
@@ -157,7 +131,7 @@ void write_material(Text& out, const ColladaOptions& options) {
       << "\"><instance_effect url=\"#" << effect_id << "\"/></material>\n  </library_materials>\n";
 }
 
-void write_geometry(Text& out, const Avatar& avatar) {
+void write_geometry(NumberText& out, const Avatar& avatar) {
   const SeamVertices split = split_at_seams(avatar);
   const std::vector<Eigen::Vector3f> normals = unit_normals(avatar.mesh);
   out << "  <library_geometries>\n    <geometry id=\"" << geometry_id << "\" name=\"" << geometry_id << "\"><mesh>\n";
@@ -189,14 +163,14 @@ void write_geometry(Text& out, const Avatar& avatar) {
 
 /// Row by row, as COLLADA has matrices.
 template <class Matrix>
-void write_matrix(Text& out, const Matrix& matrix, char separator) {
+void write_matrix(NumberText& out, const Matrix& matrix, char separator) {
   for (int row = 0; row < 4; ++row)
     for (int column = 0; column < 4; ++column)
       out << static_cast<float>(matrix(row, column)) << (row == 3 && column == 3 ? separator : ' ');
 }
 
 /// The pairs of joint and weight of every vertex, weights by their place in a table of those that occur.
-void write_vertex_weights(Text& out, const SkinTables& tables) {
+void write_vertex_weights(NumberText& out, const SkinTables& tables) {
   constexpr int unit = WholeInfluences::weight_unit;
   std::vector<uint32_t> place_of(unit + 1, 0);
   for (const WholeInfluences& influences : tables.influences)
@@ -234,7 +208,7 @@ void write_vertex_weights(Text& out, const SkinTables& tables) {
   out << "</v>\n      </vertex_weights>\n";
 }
 
-void write_controller(Text& out, const Avatar& avatar, const std::vector<std::string>& ids) {
+void write_controller(NumberText& out, const Avatar& avatar, const std::vector<std::string>& ids) {
   const SkinTables tables = make_skin_tables(avatar);
   out << "  <library_controllers>\n    <controller id=\"" << controller_id << "\" name=\"" << controller_id
       << "\"><skin source=\"#" << geometry_id << "\">\n"
@@ -254,8 +228,61 @@ void write_controller(Text& out, const Avatar& avatar, const std::vector<std::st
   out << "    </skin></controller>\n  </library_controllers>\n";
 }
 
+/// The clips as one timeline: the matrix of every moving joint, key by key.
+void write_animation(NumberText& out, std::span<const AnimationClip> clips, const std::vector<std::string>& ids) {
+  std::vector<double> times;
+  // A clip's first key is the last one of the clip before.
+  const auto first_key = [&](const AnimationClip& clip) { return &clip == clips.data() ? size_t{0} : size_t{1}; };
+  for (const AnimationClip& clip : clips) {
+    const double start = times.empty() ? 0 : times.back();
+    for (size_t key = first_key(clip); key < clip.times_s.size(); ++key) times.push_back(start + clip.times_s[key]);
+  }
+  out << "  <library_animations>\n";
+  for (size_t track = 0; track < clips.front().tracks.size(); ++track) {
+    const std::string& joint = ids[clips.front().tracks[track].joint];
+    const std::string id = std::string(own_prefix) + "-motion-" + joint;
+    const auto source = [&](const char* name, const char* array, size_t count, const auto& write_values,
+                            const char* accessor) {
+      out << "      <source id=\"" << id << name << "\"><" << array << " id=\"" << id << name << "-array\" count=\""
+          << count << "\">";
+      write_values();
+      out << "</" << array << "><technique_common><accessor source=\"#" << id << name << "-array\" count=\""
+          << times.size() << "\" " << accessor << "</accessor></technique_common></source>\n";
+    };
+    out << "    <animation id=\"" << id << "\">\n";
+    source(
+        "-input", "float_array", times.size(),
+        [&] {
+          for (const double time : times) out << static_cast<float>(time) << ' ';
+        },
+        "stride=\"1\"><param name=\"TIME\" type=\"float\"/>");
+    source(
+        "-output", "float_array", times.size() * 16,
+        [&] {
+          for (const AnimationClip& clip : clips)
+            for (size_t key = first_key(clip); key < clip.times_s.size(); ++key)
+              write_matrix(out, clip.tracks[track].parent_from_joint[key].matrix(), '\n');
+        },
+        "stride=\"16\"><param name=\"TRANSFORM\" type=\"float4x4\"/>");
+    source(
+        "-interpolation", "Name_array", times.size(),
+        [&] {
+          for (size_t key = 0; key < times.size(); ++key) out << "LINEAR ";
+        },
+        "stride=\"1\"><param name=\"INTERPOLATION\" type=\"name\"/>");
+    out << "      <sampler id=\"" << id << "-sampler\">";
+    for (const auto& [semantic, name] :
+         {std::pair{"INPUT", "-input"}, {"OUTPUT", "-output"}, {"INTERPOLATION", "-interpolation"}})
+      out << "<input semantic=\"" << semantic << "\" source=\"#" << id << name << "\"/>";
+    out << "</sampler>\n      <channel source=\"#" << id << "-sampler\" target=\"" << joint << "/transform\"/>\n"
+        << "    </animation>\n";
+  }
+  out << "  </library_animations>\n";
+}
+
 /// The joint and all below it.
-void write_joint(Text& out, const Skeleton& skeleton, const std::vector<std::string>& ids, size_t joint, int depth) {
+void write_joint(NumberText& out, const Skeleton& skeleton, const std::vector<std::string>& ids, size_t joint,
+                 int depth) {
   const std::string indent(size_t{2} * static_cast<size_t>(depth), ' ');
   out << indent << "<node id=\"" << ids[joint] << "\" name=\"" << escaped(skeleton.joints[joint].name) << "\" sid=\""
       << ids[joint] << "\" type=\"JOINT\">\n"
@@ -267,7 +294,7 @@ void write_joint(Text& out, const Skeleton& skeleton, const std::vector<std::str
   out << indent << "</node>\n";
 }
 
-void write_scene(Text& out, const Skeleton& skeleton, const std::vector<std::string>& ids) {
+void write_scene(NumberText& out, const Skeleton& skeleton, const std::vector<std::string>& ids) {
   const bool rigged = !ids.empty();
   out << "  <library_visual_scenes>\n    <visual_scene id=\"" << scene_id << "\" name=\"" << scene_id << "\">\n";
   constexpr int scene_depth = 3;
@@ -285,15 +312,16 @@ void write_scene(Text& out, const Skeleton& skeleton, const std::vector<std::str
 
 }  // namespace
 
-std::string write_collada(const Avatar& avatar, const ColladaOptions& options) {
+std::string write_collada(const Avatar& avatar, std::span<const AnimationClip> clips, const ColladaOptions& options) {
   const std::vector<std::string> ids = joint_ids(avatar.skeleton);
-  Text out;
+  NumberText out;
   constexpr size_t vertex_bytes = 130, triangle_bytes = 60;  // a little more than they take, to grow only once
   out.reserve(avatar.mesh.positions.size() * vertex_bytes + avatar.mesh.triangles.size() * triangle_bytes);
   write_header(out, options);
   write_material(out, options);
   write_geometry(out, avatar);
   if (!ids.empty()) write_controller(out, avatar, ids);
+  if (!clips.empty()) write_animation(out, clips, ids);
   write_scene(out, avatar.skeleton, ids);
   return out.take();
 }

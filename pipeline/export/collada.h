@@ -1,7 +1,9 @@
 #pragma once
 
+#include <span>
 #include <string>
 
+#include "pipeline/export/animation.h"
 #include "pipeline/types/avatar.h"
 
 namespace booth {
@@ -18,8 +20,11 @@ struct ColladaOptions {
 /// exactly 1 as printed, the joint tree at rest with sids equal to the joints' names. A joint's name that is no XML
 /// name, or one of the document's own ids, is altered until it fits. An avatar without joints is written as a plain
 /// geometry instance.
+/// @param clips  written as one animation, one clip after the other, as most readers know only one timeline; each has
+/// to
+///               begin as the one before it ends, and to move the same joints
 /// @pre check(avatar) holds
 /// Source: The Khronos Group, "COLLADA – Digital Asset Schema Release 1.4.1", 2nd edition, 2008.
-std::string write_collada(const Avatar& avatar, const ColladaOptions& options);
+std::string write_collada(const Avatar& avatar, std::span<const AnimationClip> clips, const ColladaOptions& options);
 
 }  // namespace booth

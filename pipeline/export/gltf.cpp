@@ -1,6 +1,7 @@
 #include "pipeline/export/gltf.h"
 
 #include <Eigen/Geometry>
+#include <algorithm>
 #include <cstring>
 #include <limits>
 #include <nlohmann/json.hpp>
@@ -135,9 +136,10 @@ size_t add_weights(Document& document, const SkinTables& tables, const SeamVerti
 }
 
 /// The material: matt, in the colours of the texture.
-size_t add_material(Document& document, std::span<const uint8_t> texture_png) {
-  const size_t view = document.add_view(texture_png, 0);
-  const size_t image = document.append("images", {{"name", "atlas"}, {"bufferView", view}, {"mimeType", "image/png"}});
+size_t add_material(Document& document, std::span<const uint8_t> encoded, ImageFormat format) {
+  const size_t view = document.add_view(encoded, 0);
+  const char* mime_type = format == ImageFormat::png ? "image/png" : "image/jpeg";
+  const size_t image = document.append("images", {{"name", "atlas"}, {"bufferView", view}, {"mimeType", mime_type}});
   const size_t sampler = document.append("samplers", {{"magFilter", linear_filter},
                                                       {"minFilter", linear_mipmap_filter},
                                                       {"wrapS", clamp_to_edge},
@@ -169,9 +171,48 @@ size_t add_skin(Document& document, const SkinTables& tables, size_t first_joint
   return document.append("skins", {{"inverseBindMatrices", accessor}, {"skeleton", first_joint}, {"joints", joints}});
 }
 
+/// The rotations of a track as x, y, z, w, each on the same half of the sphere as the one before.
+std::vector<std::array<float, 4>> rotations_of(const JointTrack& track) {
+  std::vector<std::array<float, 4>> rotations;
+  Eigen::Quaterniond before = Eigen::Quaterniond::Identity();
+  for (const Eigen::Isometry3d& pose : track.parent_from_joint) {
+    Eigen::Quaterniond q = Eigen::Quaterniond(pose.linear()).normalized();
+    if (q.dot(before) < 0) q.coeffs() = -q.coeffs();
+    before = q;
+    const Eigen::Quaternionf rounded = q.cast<float>();
+    rotations.push_back({rounded.x(), rounded.y(), rounded.z(), rounded.w()});
+  }
+  return rotations;
+}
+
+void add_animation(Document& document, const AnimationClip& clip, size_t first_joint) {
+  std::vector<float> times(clip.times_s.begin(), clip.times_s.end());
+  const size_t input = document.add_accessor(times, float_type, "SCALAR", 0);
+  document.json["accessors"][input]["min"] = {times.front()};
+  document.json["accessors"][input]["max"] = {times.back()};
+  Json samplers = Json::array(), channels = Json::array();
+  const auto add_channel = [&](size_t joint, const char* path, size_t output) {
+    channels.push_back({{"sampler", samplers.size()}, {"target", {{"node", first_joint + joint}, {"path", path}}}});
+    samplers.push_back({{"input", input}, {"interpolation", "LINEAR"}, {"output", output}});
+  };
+  for (const JointTrack& track : clip.tracks) {
+    add_channel(track.joint, "rotation", document.add_accessor(rotations_of(track), float_type, "VEC4", 0));
+    const auto& poses = track.parent_from_joint;
+    const bool moves = std::any_of(poses.begin(), poses.end(), [&](const Eigen::Isometry3d& pose) {
+      return pose.translation() != poses.front().translation();
+    });
+    if (!moves) continue;
+    std::vector<Eigen::Vector3f> places;
+    for (const Eigen::Isometry3d& pose : poses) places.push_back(pose.translation().cast<float>());
+    add_channel(track.joint, "translation", document.add_accessor(places, float_type, "VEC3", 0));
+  }
+  document.append("animations", {{"name", clip.name}, {"samplers", samplers}, {"channels", channels}});
+}
+
 }  // namespace
 
-std::vector<uint8_t> write_glb(const Avatar& avatar, std::span<const uint8_t> texture_png, const GltfOptions& options) {
+std::vector<uint8_t> write_glb(const Avatar& avatar, std::span<const AnimationClip> clips,
+                               std::span<const uint8_t> texture, const GltfOptions& options) {
   const SeamVertices split = split_at_seams(avatar);
   Document document;
   document.json["asset"] = {{"version", "2.0"}, {"generator", options.generator}};
@@ -192,10 +233,11 @@ std::vector<uint8_t> write_glb(const Avatar& avatar, std::span<const uint8_t> te
     const size_t root = add_joint_nodes(document, avatar.skeleton);
     roots.push_back(root);
     body["skin"] = add_skin(document, tables, root);
+    for (const AnimationClip& clip : clips) add_animation(document, clip, root);
   }
   const Json primitive = {{"attributes", attributes},
                           {"indices", add_indices(document, split)},
-                          {"material", add_material(document, texture_png)}};
+                          {"material", add_material(document, texture, options.texture_format)}};
   document.append("meshes", {{"name", "avatar"}, {"primitives", Json::array({primitive})}});
   roots.push_back(document.append("nodes", body));
   document.append("scenes", {{"nodes", roots}});

@@ -30,31 +30,43 @@ struct Viewer {
   Eigen::Vector3d to_camera(const Eigen::Vector3d& p_world) const { return rotation * (p_world - center); }
 };
 
-/// Stands so far away that every vertex projects inside the margins.
-Viewer place_viewer(const Mesh& mesh, const PortraitOptions& options) {
+/// Looks from that direction; where from is still open.
+Viewer look_from(double azimuth_rad, double elevation_rad) {
   Viewer viewer;
-  const double azimuth = options.azimuth_rad, elevation = options.elevation_rad;
-  const Eigen::Vector3d towards_viewer(std::sin(azimuth) * std::cos(elevation), std::sin(elevation),
-                                       std::cos(azimuth) * std::cos(elevation));
-  const Eigen::Vector3d right(std::cos(azimuth), 0, -std::sin(azimuth));
-  viewer.rotation.row(0) = right;
+  const Eigen::Vector3d towards_viewer(std::sin(azimuth_rad) * std::cos(elevation_rad), std::sin(elevation_rad),
+                                       std::cos(azimuth_rad) * std::cos(elevation_rad));
+  viewer.rotation.row(0) = Eigen::Vector3d(std::cos(azimuth_rad), 0, -std::sin(azimuth_rad));
   viewer.rotation.row(2) = -towards_viewer;
   viewer.rotation.row(1) = viewer.rotation.row(2).cross(viewer.rotation.row(0));
+  return viewer;
+}
 
-  Eigen::AlignedBox3d seen;  // in camera directions, around the world's origin
-  for (const Eigen::Vector3f& p : mesh.positions) seen.extend(viewer.rotation * p.cast<double>());
-  const Eigen::Vector3d middle = seen.center();
+/// How far from `middle` (world frame) a viewer of that rotation has to stand so that every vertex projects inside the
+/// margins.
+double distance_for(const Mesh& mesh, const Viewer& viewer, const Eigen::Vector3d& middle, int width, int height) {
   const double half_tangent_y = std::tan(vertical_view_rad / 2) * (1 - 2 * margin);
-  const double half_tangent_x = half_tangent_y * options.width / options.height;
+  const double half_tangent_x = half_tangent_y * width / height;
+  constexpr double nearest_m = 0.05;  // to the nearest vertex
   double distance = 0;
   for (const Eigen::Vector3f& p : mesh.positions) {
-    const Eigen::Vector3d q = viewer.rotation * p.cast<double>() - middle;
-    distance = std::max({distance, std::abs(q.x()) / half_tangent_x - q.z(), std::abs(q.y()) / half_tangent_y - q.z()});
+    const Eigen::Vector3d q = viewer.rotation * (p.cast<double>() - middle);
+    distance = std::max({distance, std::abs(q.x()) / half_tangent_x - q.z(), std::abs(q.y()) / half_tangent_y - q.z(),
+                         nearest_m - q.z()});
   }
-  constexpr double nearest_m = 0.05;
-  distance = std::max(distance, seen.sizes().z() / 2 + nearest_m);
-  viewer.center = viewer.rotation.transpose() * (middle - Eigen::Vector3d(0, 0, distance));
-  viewer.focal_px = options.height / 2.0 / std::tan(vertical_view_rad / 2);
+  return distance;
+}
+
+void stand_back(const Eigen::Vector3d& middle, double distance, int height, Viewer& viewer) {
+  viewer.center = middle - viewer.rotation.transpose() * Eigen::Vector3d(0, 0, distance);
+  viewer.focal_px = height / 2.0 / std::tan(vertical_view_rad / 2);
+}
+
+Viewer place_viewer(const Mesh& mesh, const PortraitOptions& options) {
+  Viewer viewer = look_from(options.azimuth_rad, options.elevation_rad);
+  Eigen::AlignedBox3d seen;  // in camera directions, around the world's origin
+  for (const Eigen::Vector3f& p : mesh.positions) seen.extend(viewer.rotation * p.cast<double>());
+  const Eigen::Vector3d middle = viewer.rotation.transpose() * seen.center();
+  stand_back(middle, distance_for(mesh, viewer, middle, options.width, options.height), options.height, viewer);
   return viewer;
 }
 
@@ -115,11 +127,11 @@ struct Lamp {
   float strength;
 };
 
-/// Lamps spread evenly over the sphere: bright above, dimmer below, brightest around a point above the viewer's left
-/// shoulder. Scaled so that an unshadowed surface which faces the viewer receives 1.
-std::vector<Lamp> light_dome(const Viewer& viewer) {
+/// Lamps spread evenly over the sphere: bright above, dimmer below. `key` is how much brighter it is around a point
+/// above the viewer's left shoulder. Scaled so that an unshadowed surface which faces the viewer receives 1.
+std::vector<Lamp> light_dome(const Viewer& viewer, double key_light) {
   constexpr int lamps = 128;
-  constexpr double floor_light = 0.45, sky_light = 0.35, key_light = 2.2, key_sharpness = 6;
+  constexpr double floor_light = 0.45, sky_light = 0.35, key_sharpness = 6;
   const Eigen::Vector3d towards_viewer = -viewer.rotation.row(2).transpose();
   const Eigen::Vector3d key =
       (towards_viewer - 0.55 * viewer.rotation.row(0).transpose() + Eigen::Vector3d(0, 0.75, 0)).normalized();
@@ -139,10 +151,10 @@ std::vector<Lamp> light_dome(const Viewer& viewer) {
   return dome;
 }
 
-/// What every vertex receives from the lamps that it sees, about 0 … 1.2. Nothing where it is turned away so far from
-/// the viewer that it can only be seen from inside.
-std::vector<float> light_at_vertices(const Mesh& mesh, const Viewer& viewer, const Work& work) {
-  const std::vector<Lamp> dome = light_dome(viewer);
+/// What every vertex receives from the lamps that it sees, about 0 … 1.2. With a viewer, nothing where it is turned
+/// away so far that it can only be seen from inside.
+std::vector<float> light_at_vertices(const Mesh& mesh, const std::vector<Lamp>& dome, const Viewer* viewer,
+                                     const Work& work) {
   const std::vector<Eigen::Vector3f> normals = vertex_normals(mesh);
   const Occluder occluder(mesh);
   std::vector<float> light(mesh.positions.size(), 0);
@@ -150,7 +162,9 @@ std::vector<float> light_at_vertices(const Mesh& mesh, const Viewer& viewer, con
   work.parallel_for(light.size(), grain, [&](size_t begin, size_t end) {
     for (size_t v = begin; v < end; ++v) {
       constexpr float turned_away = -0.5F;  // cosine; triangles at the outline reach a little behind it
-      if (normals[v].dot((viewer.center.cast<float>() - mesh.positions[v]).normalized()) < turned_away) continue;
+      if (viewer != nullptr &&
+          normals[v].dot((viewer->center.cast<float>() - mesh.positions[v]).normalized()) < turned_away)
+        continue;
       constexpr float lift_m = 1e-3F;  // off the vertex's own triangles
       const Eigen::Vector3f origin = mesh.positions[v] + lift_m * normals[v];
       for (const Lamp& lamp : dome) {
@@ -217,7 +231,8 @@ struct Fragment {
 /// What the rendering of all rows shares.
 struct Picture {
   const Avatar& avatar;
-  const PortraitOptions& options;
+  int width, height;     // pixels
+  int samples_per_axis;  // of a pixel
   std::vector<Projected> vertices;
   std::vector<float> light;
   Texture texture;
@@ -290,12 +305,12 @@ Eigen::Array3f shade(const Picture& picture, const Fragment& fragment) {
 }
 
 void render_rows(const Picture& picture, int first, int last, Image& image) {
-  const int samples = picture.options.samples_per_axis;
-  Band band{first * samples, last * samples, picture.options.width * samples, {}};
+  const int samples = picture.samples_per_axis;
+  Band band{first * samples, last * samples, picture.width * samples, {}};
   band.fragments.resize(static_cast<size_t>(band.bottom - band.top) * static_cast<size_t>(band.width));
   for (uint32_t t = 0; t < picture.avatar.mesh.triangles.size(); ++t) rasterise(picture, t, band);
   for (int y = first; y < last; ++y)
-    for (int x = 0; x < picture.options.width; ++x) {
+    for (int x = 0; x < picture.width; ++x) {
       Eigen::Array3f sum = Eigen::Array3f::Zero();
       int covered = 0;
       for (int sy = 0; sy < samples; ++sy)
@@ -313,33 +328,69 @@ void render_rows(const Picture& picture, int first, int last, Image& image) {
     }
 }
 
-std::vector<Projected> project_vertices(const Mesh& mesh, const Viewer& viewer, const PortraitOptions& options) {
+std::vector<Projected> project_vertices(const Mesh& mesh, const Viewer& viewer, int width, int height, int samples) {
   std::vector<Projected> projected;
   projected.reserve(mesh.positions.size());
-  const double samples = options.samples_per_axis;
   for (const Eigen::Vector3f& p : mesh.positions) {
     const Eigen::Vector3d q = viewer.to_camera(p.cast<double>());
     // Sample i of n lies (i + 0.5) / n − 0.5 from a pixel's centre; the axis meets the picture's middle.
-    const double x = samples * (options.width / 2.0 + viewer.focal_px * q.x() / q.z()) - 0.5;
-    const double y = samples * (options.height / 2.0 + viewer.focal_px * q.y() / q.z()) - 0.5;
+    const double x = samples * (width / 2.0 + viewer.focal_px * q.x() / q.z()) - 0.5;
+    const double y = samples * (height / 2.0 + viewer.focal_px * q.y() / q.z()) - 0.5;
     projected.push_back({static_cast<float>(x), static_cast<float>(y), static_cast<float>(1 / q.z())});
   }
   return projected;
 }
 
-}  // namespace
-
-Image render_portrait(const Avatar& avatar, const PortraitOptions& options, const Work& work) {
-  Image image(options.width, options.height, 4);
-  if (avatar.mesh.triangles.empty()) return image;
-  const Viewer viewer = place_viewer(avatar.mesh, options);
-  const Picture picture{avatar, options, project_vertices(avatar.mesh, viewer, options),
-                        light_at_vertices(avatar.mesh, viewer, work), Texture(avatar.atlas.image)};
+Image render(const Picture& picture, const Work& work) {
+  Image image(picture.width, picture.height, 4);
   constexpr size_t rows_a_band = 8;
-  work.parallel_for(static_cast<size_t>(options.height), rows_a_band, [&](size_t begin, size_t end) {
+  work.parallel_for(static_cast<size_t>(picture.height), rows_a_band, [&](size_t begin, size_t end) {
     render_rows(picture, static_cast<int>(begin), static_cast<int>(end), image);
   });
   return image;
+}
+
+}  // namespace
+
+Image render_portrait(const Avatar& avatar, const PortraitOptions& options, const Work& work) {
+  if (avatar.mesh.triangles.empty()) return {options.width, options.height, 4};
+  constexpr double key_light = 2.2;
+  const Viewer viewer = place_viewer(avatar.mesh, options);
+  return render(
+      {avatar, options.width, options.height, options.samples_per_axis,
+       project_vertices(avatar.mesh, viewer, options.width, options.height, options.samples_per_axis),
+       light_at_vertices(avatar.mesh, light_dome(viewer, key_light), &viewer, work), Texture(avatar.atlas.image)},
+      work);
+}
+
+std::vector<Image> render_turntable(const Avatar& avatar, const TurntableOptions& options, const Work& work) {
+  std::vector<Image> images;
+  if (avatar.mesh.triangles.empty()) {
+    images.assign(static_cast<size_t>(options.frames), Image(options.width, options.height, 4));
+    return images;
+  }
+  constexpr double elevation_rad = 0.08;
+  std::vector<Viewer> viewers;
+  for (int i = 0; i < options.frames; ++i)
+    viewers.push_back(look_from(2 * std::numbers::pi * i / options.frames, elevation_rad));
+  Eigen::AlignedBox3d box;
+  for (const Eigen::Vector3f& p : avatar.mesh.positions) box.extend(p.cast<double>());
+  double distance = 0;  // the same all round
+  for (const Viewer& viewer : viewers)
+    distance = std::max(distance, distance_for(avatar.mesh, viewer, box.center(), options.width, options.height));
+
+  constexpr double no_key_light = 0;
+  const std::vector<float> light =
+      light_at_vertices(avatar.mesh, light_dome(viewers.front(), no_key_light), nullptr, work);
+  for (Viewer& viewer : viewers) {
+    stand_back(box.center(), distance, options.height, viewer);
+    images.push_back(
+        render({avatar, options.width, options.height, options.samples_per_axis,
+                project_vertices(avatar.mesh, viewer, options.width, options.height, options.samples_per_axis), light,
+                Texture(avatar.atlas.image)},
+               work));
+  }
+  return images;
 }
 
 }  // namespace booth

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <vector>
+
 #include "pipeline/types/avatar.h"
 #include "pipeline/types/image.h"
 #include "pipeline/types/work.h"
@@ -22,5 +24,20 @@ struct PortraitOptions {
 /// @pre check(avatar) holds
 /// Cost: about 60 shadow rays a vertex, and one texture sample for each covered sample of the image.
 Image render_portrait(const Avatar& avatar, const PortraitOptions& options, const Work& work = {});
+
+struct TurntableOptions {
+  int width = 360;           ///< pixels, 1 … 8192
+  int height = 480;          ///< pixels, 1 … 8192
+  int frames = 30;           ///< of one turn, 1 … 720
+  double seconds = 4;        ///< that one turn takes, for whoever plays it
+  int samples_per_axis = 2;  ///< samples a pixel, squared; 1 … 8
+};
+
+/// Pictures of the avatar going round once, as render_portrait makes them: the first from the front, then from its left
+/// side. The avatar keeps its place and size. The light is even from all around, so that no side lies in the dark.
+///
+/// @return RGBA, one a frame
+/// @pre check(avatar) holds
+std::vector<Image> render_turntable(const Avatar& avatar, const TurntableOptions& options, const Work& work = {});
 
 }  // namespace booth

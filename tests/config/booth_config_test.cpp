@@ -77,6 +77,18 @@ TEST(DefaultFile, ItsExampleIsValidAndShowsTheDefaults) {
   EXPECT_EQ(example.delay_ms, plain.delay_ms);
 }
 
+TEST(ParseConfig, ReadsListsOfWords) {
+  const ConfigReading reading = parse_config("[export]\nformats = [\"stl\", \"ply\"]\ntexture = \"jpeg\"", "/");
+  ASSERT_THAT(reading.faults, IsEmpty());
+  EXPECT_THAT(reading.config.files.formats, ElementsAre(MeshFormat::stl, MeshFormat::ply));
+  EXPECT_EQ(reading.config.files.texture, ImageFormat::jpeg);
+  EXPECT_THAT(write_config(reading.config), HasSubstr("formats = ['stl', 'ply']"));
+  EXPECT_THAT(faults_of("[export]\nformats = [\"stl\", \"fbx\", \"stl\"]"),
+              ElementsAre("export.formats[1]: \"fbx\", expected one of \"stl\", \"obj\", \"ply\"",
+                          "export.formats[2]: \"stl\", expected each word once"));
+  EXPECT_THAT(faults_of("[export]\nformats = \"stl\""), ElementsAre(HasSubstr("expected an array of words")));
+}
+
 TEST(ParseConfig, NothingIsTheDefault) {
   const ConfigReading reading = parse_config("", "/etc/booth");
   EXPECT_THAT(reading.faults, IsEmpty());
@@ -176,7 +188,7 @@ TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
       )"),
       testing::UnorderedElementsAre(
           "colour: \"red\", expected one of the keys booth, api, capture, disk, jobs, log, drivers, replay, "
-          "reconstruct",
+          "reconstruct, export",
           "log: 3, expected a table: [log]", "booth.name: \"\", expected a text of 1 … 64 bytes on one line",
           "capture.frame_timeout_ms: 0, expected 50 … 60000",
           "capture.min_cameras: \"many\", expected a whole number, 1 … 256",

@@ -56,7 +56,33 @@ TEST(AvatarFiles, AreThoseOfTheContract) {
   const auto files = make_avatar_files(synthetic::make_avatar(synthetic::person()), metadata(), {});
   std::vector<std::string> names;
   for (const NamedBytes& file : files) names.push_back(file.name);
-  EXPECT_THAT(names, testing::ElementsAre("avatar.dae", "texture.png", "avatar.glb", "preview.png", "metadata.json"));
+  EXPECT_THAT(names,
+              testing::UnorderedElementsAre("avatar.dae", "texture.png", "avatar.glb", "preview.png", "metadata.json"));
+  EXPECT_EQ(names.back(), "metadata.json");
+}
+
+AvatarFileOptions everything() {
+  AvatarFileOptions options;
+  options.texture = ImageFormat::jpeg;
+  options.animation = true;
+  options.turntable = true;
+  options.formats = {MeshFormat::stl, MeshFormat::obj, MeshFormat::ply};
+  options.turning.frames = 6;
+  return options;
+}
+
+TEST(AvatarFiles, AreAllThatIsAskedFor) {
+  const auto files = make_avatar_files(synthetic::make_avatar(synthetic::person()), metadata(), everything());
+  std::vector<std::string> names;
+  for (const NamedBytes& file : files) names.push_back(file.name);
+  EXPECT_THAT(names,
+              testing::UnorderedElementsAre("avatar.dae", "texture.jpg", "avatar.glb", "preview.png", "turntable.webp",
+                                            "avatar.stl", "avatar.obj", "avatar.mtl", "avatar.ply", "metadata.json"));
+  const auto texture = read_image_header(bytes_of(files, "texture.jpg"));
+  ASSERT_TRUE(texture);
+  EXPECT_EQ(texture->format, ImageFormat::jpeg);
+  const auto& dae = bytes_of(files, "avatar.dae");
+  EXPECT_NE(std::string(dae.begin(), dae.end()).find("<init_from>texture.jpg<"), std::string::npos);
 }
 
 TEST(AvatarFiles, AreDescribedByTheirMetadata) {

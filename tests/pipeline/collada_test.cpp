@@ -41,7 +41,7 @@ std::vector<float> array(const std::string& collada, const std::string& id) {
 
 TEST(Collada, HoldsEveryPositionExactly) {
   const Avatar avatar = synthetic::make_avatar(synthetic::person());
-  const std::vector<float> written = array(write_collada(avatar, {}), "avatar-positions");
+  const std::vector<float> written = array(write_collada(avatar, {}, {}), "avatar-positions");
   ASSERT_EQ(written.size(), avatar.mesh.positions.size() * 3);
   for (size_t v = 0; v < avatar.mesh.positions.size(); ++v)
     for (size_t axis = 0; axis < 3; ++axis)
@@ -50,7 +50,7 @@ TEST(Collada, HoldsEveryPositionExactly) {
 
 TEST(Collada, TurnsUvsUpsideDown) {
   const Avatar avatar = synthetic::make_avatar(synthetic::person());
-  const std::string collada = write_collada(avatar, {});
+  const std::string collada = write_collada(avatar, {}, {});
   const std::vector<float> uvs = array(collada, "avatar-uvs");
   const std::vector<float> corners = numbers(between(collada, "<p>", "</p>"));
   ASSERT_EQ(corners.size(), avatar.mesh.triangles.size() * 9);
@@ -65,19 +65,19 @@ TEST(Collada, TurnsUvsUpsideDown) {
 
 TEST(Collada, IsTheSameInEveryLocale) {
   const Avatar avatar = synthetic::make_avatar(synthetic::person());
-  const std::string expected = write_collada(avatar, {});
+  const std::string expected = write_collada(avatar, {}, {});
   const std::string before = std::setlocale(LC_ALL, nullptr);
   for (const char* locale : {"de_DE.UTF-8", "fr_FR.UTF-8"})  // those with a decimal comma that are installed
     if (std::setlocale(LC_ALL, locale) != nullptr) {
-      EXPECT_EQ(write_collada(avatar, {}), expected);
+      EXPECT_EQ(write_collada(avatar, {}, {}), expected);
     }
   std::setlocale(LC_ALL, before.c_str());
 }
 
 TEST(Collada, EscapesTextAndPaths) {
   const Avatar avatar = synthetic::make_avatar(synthetic::person(), {.rigged = false});
-  const std::string collada =
-      write_collada(avatar, {.texture_file = "my <pictures>/a&b ü.png", .authoring_tool = "A \"tool\" <1> & more\x01"});
+  const std::string collada = write_collada(
+      avatar, {}, {.texture_file = "my <pictures>/a&b ü.png", .authoring_tool = "A \"tool\" <1> & more\x01"});
   EXPECT_THAT(collada, HasSubstr("<init_from>my%20%3Cpictures%3E/a%26b%20%C3%BC.png</init_from>"));
   EXPECT_THAT(collada, HasSubstr("A &quot;tool&quot; &lt;1&gt; &amp; more\xef\xbf\xbd"));
 }
@@ -88,7 +88,7 @@ TEST(Collada, GivesEveryJointAnIdThatXmlAllows) {
   avatar.skeleton.joints[1].name = "3rd bone";
   avatar.skeleton.joints[2].name = "a b";
   avatar.skeleton.joints[3].name = "a&b";
-  const std::string collada = write_collada(avatar, {});
+  const std::string collada = write_collada(avatar, {}, {});
   const std::string names = between(collada, "<Name_array", "</Name_array>");
   EXPECT_THAT(names, HasSubstr(">_avatar-mesh _3rd_bone a_b a_b_2 "));
   EXPECT_THAT(collada, HasSubstr("<skeleton>#_avatar-mesh</skeleton>"));
@@ -97,7 +97,7 @@ TEST(Collada, GivesEveryJointAnIdThatXmlAllows) {
 
 TEST(Collada, KeepsWeightsWithinATwentyThousandth) {
   const Avatar avatar = synthetic::make_avatar(synthetic::person());
-  const std::string collada = write_collada(avatar, {});
+  const std::string collada = write_collada(avatar, {}, {});
   const std::vector<float> table = array(collada, "avatar-weights");
   const std::vector<float> counts = numbers(between(collada, "<vcount>", "</vcount>"));
   const std::vector<float> pairs = numbers(between(collada, "<v>", "</v>"));
@@ -117,12 +117,12 @@ TEST(Collada, DropsWeightsTooSmallToMatter) {
   Avatar avatar = synthetic::make_avatar(synthetic::person());
   avatar.skin.influences[0] = {{2, 5, 1, 0}, {1, 1e-6F, 1e-7F, 0}};
   ASSERT_TRUE(check(avatar));
-  const std::string counts = between(write_collada(avatar, {}), "<vcount>", "</vcount>");
+  const std::string counts = between(write_collada(avatar, {}, {}), "<vcount>", "</vcount>");
   EXPECT_EQ(counts.substr(0, 2), "1 ");
 }
 
 TEST(Collada, OfAnUnriggedAvatarHasNoController) {
-  const std::string collada = write_collada(synthetic::make_avatar(synthetic::person(), {.rigged = false}), {});
+  const std::string collada = write_collada(synthetic::make_avatar(synthetic::person(), {.rigged = false}), {}, {});
   EXPECT_THAT(collada, Not(HasSubstr("controller")));
   EXPECT_THAT(collada, Not(HasSubstr("JOINT")));
   EXPECT_THAT(collada, HasSubstr("<instance_geometry url=\"#avatar-mesh\">"));
@@ -133,7 +133,7 @@ TEST(Collada, WritesUnitNormalsWhereThereIsNoArea) {
   avatar.mesh.positions = {{0, 0, 0}, {1, 0, 0}, {2, 0, 0}};
   avatar.mesh.triangles = {{0, 1, 2}};
   avatar.atlas = {Image(2, 2, 3), {{Eigen::Vector2f(0, 0), Eigen::Vector2f(1, 0), Eigen::Vector2f(1, 1)}}};
-  EXPECT_THAT(array(write_collada(avatar, {}), "avatar-normals"), testing::ElementsAre(0, 1, 0, 0, 1, 0, 0, 1, 0));
+  EXPECT_THAT(array(write_collada(avatar, {}, {}), "avatar-normals"), testing::ElementsAre(0, 1, 0, 0, 1, 0, 0, 1, 0));
 }
 
 }  // namespace

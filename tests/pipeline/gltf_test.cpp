@@ -63,7 +63,7 @@ constexpr int unsigned_byte = 5121, unsigned_short = 5123, unsigned_int = 5125;
 
 TEST(Glb, HoldsEveryCornerOfTheAvatar) {
   const Avatar avatar = synthetic::make_avatar(synthetic::person());
-  const Glb glb(write_glb(avatar, {}, {}));
+  const Glb glb(write_glb(avatar, {}, {}, {}));
   const auto positions = glb.array<float>(glb.attribute("POSITION"));
   const auto uvs = glb.array<float>(glb.attribute("TEXCOORD_0"));
   ASSERT_EQ(glb.component_type(glb.primitive()["indices"]), unsigned_short);
@@ -84,13 +84,13 @@ TEST(Glb, SplitsVerticesNoMoreThanTheSeamsDemand) {
     for (size_t k = 0; k < 3; ++k)
       distinct.emplace(avatar.mesh.triangles[t][k], avatar.atlas.uv[t][k].x(), avatar.atlas.uv[t][k].y());
   EXPECT_GT(distinct.size(), avatar.mesh.positions.size());
-  const Glb glb(write_glb(avatar, {}, {}));
+  const Glb glb(write_glb(avatar, {}, {}, {}));
   EXPECT_EQ(glb.array<float>(glb.attribute("POSITION")).size(), distinct.size() * 3);
 }
 
 TEST(Glb, EmbedsTheTextureAsItIs) {
   const Bytes texture{1, 2, 3, 4, 5};
-  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person()), texture, {.generator = "A \"tool\""}));
+  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person()), {}, texture, {.generator = "A \"tool\""}));
   EXPECT_EQ(glb.view(glb.json["images"][0]["bufferView"]), texture);
   EXPECT_EQ(glb.json["images"][0]["mimeType"], "image/png");
   EXPECT_EQ(glb.json["asset"]["generator"], "A \"tool\"");
@@ -100,7 +100,7 @@ TEST(Glb, EmbedsTheTextureAsItIs) {
 }
 
 TEST(Glb, ViewsBeginAtMultiplesOfFour) {
-  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person()), Bytes{1, 2, 3}, {}));
+  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person()), {}, Bytes{1, 2, 3}, {}));
   for (const Json& view : glb.json["bufferViews"]) {
     EXPECT_EQ(view["byteOffset"].get<size_t>() % 4, 0U);
     EXPECT_LE(view["byteOffset"].get<size_t>() + view["byteLength"].get<size_t>(), glb.binary.size());
@@ -109,7 +109,7 @@ TEST(Glb, ViewsBeginAtMultiplesOfFour) {
 
 TEST(Glb, JointsStandWhereTheSkeletonHasThem) {
   const Avatar avatar = synthetic::make_avatar(synthetic::person());
-  const Glb glb(write_glb(avatar, {}, {}));
+  const Glb glb(write_glb(avatar, {}, {}, {}));
   const Json& skin = glb.json["skins"][0];
   const auto inverse_bind = glb.array<float>(skin["inverseBindMatrices"]);
   const auto world = world_from_joints(avatar.skeleton);
@@ -129,7 +129,7 @@ TEST(Glb, JointsStandWhereTheSkeletonHasThem) {
 }
 
 TEST(Glb, WeightsSumToOneAndUnusedJointsAreZero) {
-  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person()), {}, {}));
+  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person()), {}, {}, {}));
   ASSERT_EQ(glb.component_type(glb.attribute("JOINTS_0")), unsigned_byte);
   const auto joints = glb.array<uint8_t>(glb.attribute("JOINTS_0"));
   const auto weights = glb.array<float>(glb.attribute("WEIGHTS_0"));
@@ -141,7 +141,7 @@ TEST(Glb, WeightsSumToOneAndUnusedJointsAreZero) {
 }
 
 TEST(Glb, UsesWiderIndicesForManyVertices) {
-  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person(), {.segments = 480}), {}, {}));
+  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person(), {.segments = 480}), {}, {}, {}));
   EXPECT_GT(glb.array<float>(glb.attribute("POSITION")).size(), size_t{3} * 65535);
   EXPECT_EQ(glb.component_type(glb.primitive()["indices"]), unsigned_int);
 }
@@ -152,13 +152,13 @@ TEST(Glb, UsesWiderJointsForManyBones) {
     avatar.skeleton.joints.push_back({"extra" + std::to_string(extra), 0, Eigen::Isometry3d::Identity()});
   avatar.skin.influences[0] = {{299, 0, 0, 0}, {1, 0, 0, 0}};
   ASSERT_TRUE(check(avatar));
-  const Glb glb(write_glb(avatar, {}, {}));
+  const Glb glb(write_glb(avatar, {}, {}, {}));
   ASSERT_EQ(glb.component_type(glb.attribute("JOINTS_0")), unsigned_short);
   EXPECT_THAT(glb.array<uint16_t>(glb.attribute("JOINTS_0")), testing::Contains(299));
 }
 
 TEST(Glb, OfAnUnriggedAvatarHasNoSkin) {
-  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person(), {.rigged = false}), {}, {}));
+  const Glb glb(write_glb(synthetic::make_avatar(synthetic::person(), {.rigged = false}), {}, {}, {}));
   EXPECT_FALSE(glb.json.contains("skins"));
   EXPECT_FALSE(glb.primitive()["attributes"].contains("JOINTS_0"));
   EXPECT_EQ(glb.json["scenes"][0]["nodes"].size(), 1U);

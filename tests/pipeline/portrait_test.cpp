@@ -153,5 +153,40 @@ TEST(Portrait, SurvivesAMeshWithoutExtent) {
   EXPECT_EQ(render_portrait(avatar, small).channels, 4);
 }
 
+TEST(Turntable, GoesRoundInPlace) {
+  const Avatar avatar = synthetic::make_avatar(synthetic::person());
+  const TurntableOptions options{.width = 120, .height = 160, .frames = 8};
+  const std::vector<Image> frames = render_turntable(avatar, options);
+  ASSERT_EQ(frames.size(), 8U);
+  const Extent front = covered(frames[0]), side = covered(frames[2]), back = covered(frames[4]);
+  for (const Image& frame : frames) {
+    const Extent extent = covered(frame);
+    EXPECT_GE(extent.left, 0.03 * options.width);
+    EXPECT_LE(extent.right, 0.97 * options.width);
+    EXPECT_GE(extent.top, 0.03 * options.height);
+    EXPECT_LE(extent.bottom, 0.97 * options.height);
+    EXPECT_NEAR(extent.top, front.top, 4);
+    EXPECT_NEAR(extent.bottom, front.bottom, 4);
+  }
+  // The person is wider than deep, and as wide from behind.
+  EXPECT_LT(side.right - side.left, 0.7 * (front.right - front.left));
+  EXPECT_NEAR(back.right - back.left, front.right - front.left, 3);
+}
+
+TEST(Turntable, IsTheSameWithAnyNumberOfThreads) {
+  const Avatar avatar = synthetic::make_avatar(synthetic::person());
+  const TurntableOptions options{.width = 60, .height = 80, .frames = 3};
+  ThreadPool pool(4);
+  const auto alone = render_turntable(avatar, options), together = render_turntable(avatar, options, pool.work());
+  ASSERT_EQ(alone.size(), together.size());
+  for (size_t i = 0; i < alone.size(); ++i) EXPECT_EQ(alone[i].samples, together[i].samples);
+}
+
+TEST(Turntable, OfNothingIsEmpty) {
+  const auto frames = render_turntable({}, {.width = 8, .height = 6, .frames = 2});
+  ASSERT_EQ(frames.size(), 2U);
+  EXPECT_EQ(frames[1].samples, Image(8, 6, 4).samples);
+}
+
 }  // namespace
 }  // namespace booth
