@@ -1,9 +1,11 @@
 #!/usr/bin/env python3
 """Checks a published avatar's folder with other people's readers: check_avatar.py AVATAR_DIR
 
-Prints a line for each check: ok, FAILED with the reason, or SKIPPED where an optional program is not installed.
+Prints a line for each check: ok, FAILED with the reason, or SKIPPED where an optional program is not installed or npm
+cannot reach what it needs.
 Exit status: 0 nothing failed, 1 something failed, 77 the Python modules this needs are missing."""
 
+import fcntl
 import hashlib
 import json
 import os
@@ -31,6 +33,10 @@ TOOL_TIMEOUT_S = 240
 
 class Failed(Exception):
     """A check's finding."""
+
+
+class Skipped(Exception):
+    """Why a check could not be made."""
 
 
 def require(condition, message):
@@ -93,6 +99,23 @@ def png_header(png):
     width, height, bits, colour_type = struct.unpack(">IIBB", png[16:26])
     require(bits == 8, "it has %d bits a sample" % bits)
     return width, height, {0: 1, 2: 3, 6: 4}.get(colour_type)
+
+
+def jpeg_header(jpeg):
+    """(width, height, channels) of a JPEG."""
+    at = 2
+    while at + 9 < len(jpeg):
+        require(jpeg[at] == 0xFF, "it is no JPEG")
+        marker, length = jpeg[at + 1], struct.unpack(">H", jpeg[at + 2:at + 4])[0]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width, channels = struct.unpack(">HHB", jpeg[at + 5:at + 10])
+            return width, height, channels
+        at += 2 + length
+    raise Failed("it is no JPEG")
+
+
+def picture_header(content):
+    return jpeg_header(content) if content[:2] == b"\xff\xd8" else png_header(content)
 
 
 def pose(joints, turned, angle_rad):
@@ -184,7 +207,7 @@ def texture_is_bound(avatar):
     require(isinstance(diffuse, collada.material.Map), "the diffuse colour is no texture")
     path = diffuse.sampler.surface.image.path
     require(not re.match(r"^([a-z]+:|/|\\)", path) and ".." not in path, "the path %r is not relative" % path)
-    width, height, channels = png_header(avatar.read(path))
+    width, height, channels = picture_header(avatar.read(path))
     require(width > 0 and height > 0 and channels == 3, "the texture is no RGB picture")
     instances = list(avatar.document.scene.objects("controller" if avatar.rigged else "geometry"))
     require(len(instances) == 1, "the scene shows %d meshes" % len(instances))
@@ -353,10 +376,56 @@ def blender_poses_it(avatar):
     require(result.returncode == 0, result.stdout[-500:])
 
 
+def assimp_reads_the_mesh_files(avatar):
+    for name in ("avatar.stl", "avatar.obj", "avatar.ply"):
+        if name not in avatar.metadata["files"]:
+            continue
+        result = run(["assimp", "info", avatar.path(name)])
+        require(result.returncode == 0, "%s: %s" % (name, result.stdout[-300:]))
+        faces = re.search(r"^Faces: *(\d+)", result.stdout, re.M)
+        require(faces and int(faces.group(1)) == avatar.metadata["triangles"], "%s: %s" % (name, faces))
+
+
+def opencollada_finds_no_fault(avatar):
+    # Its exit status says nothing, its words do.
+    result = run(["opencolladavalidator", avatar.path("avatar.dae")])
+    faults = [line for line in result.stdout.splitlines() if re.search("error|warning|fail", line, re.I)]
+    require(not faults, "; ".join(faults[:3]))
+
+
+def web_readers():
+    """A folder with the npm packages that web_readers.mjs needs, installed on first use."""
+    package = os.path.join(HERE, "package.json")
+    with open(package, "rb") as content:
+        version = hashlib.sha256(content.read()).hexdigest()[:12]
+    folder = os.path.join(tempfile.gettempdir(), "avatar-booth-web-readers-%d-%s" % (os.getuid(), version))
+    os.makedirs(folder, exist_ok=True)
+    with open(os.path.join(folder, "lock"), "w", encoding="utf-8") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # checks run side by side
+        if not os.path.exists(os.path.join(folder, "complete")):
+            shutil.copy(package, folder)
+            try:
+                result = run(["npm", "install", "--no-audit", "--no-fund", "--no-package-lock", "--prefix", folder])
+            except subprocess.TimeoutExpired:
+                raise Skipped("npm took too long to install three and gltf-validator")
+            if result.returncode != 0:
+                raise Skipped("npm could not install three and gltf-validator: %s" % result.stdout.strip()[-200:])
+            with open(os.path.join(folder, "complete"), "w", encoding="utf-8"):
+                pass
+    return folder
+
+
+def web_readers_agree(avatar):
+    result = run(["node", os.path.join(HERE, "web_readers.mjs"), web_readers(), avatar.folder])
+    require(result.returncode == 0, "\n" + result.stdout[-2000:])
+
+
 CHECKS = [files_are_as_listed, collada_is_schema_valid, collada_opens_without_errors, mesh_is_complete,
           mesh_is_a_closed_manifold, texture_is_bound, glb_is_the_same_avatar, preview_is_a_portrait]
 CHECKS_OF_A_RIG = [skin_is_sound, weights_sum_to_one_as_printed, bind_pose_is_the_captured_pose]
-CHECKS_WITH_PROGRAMS = [("assimp", assimp_reads_both), ("assimp", assimp_converts), ("blender", blender_poses_it)]
+CHECKS_WITH_PROGRAMS = [("assimp", assimp_reads_both), ("assimp", assimp_converts),
+                        ("assimp", assimp_reads_the_mesh_files), ("opencolladavalidator", opencollada_finds_no_fault),
+                        ("npm", web_readers_agree), ("blender", blender_poses_it)]
 
 
 def main():
@@ -373,6 +442,8 @@ def main():
         try:
             check(avatar)
             print("ok       %s" % name)
+        except Skipped as reason:
+            print("SKIPPED  %s: %s" % (name, reason))
         except Exception as fault:  # whatever a reader throws at the file is a finding too
             failures += 1
             print("FAILED   %s: %s" % (name, fault if isinstance(fault, Failed) else repr(fault)))
