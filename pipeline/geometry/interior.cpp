@@ -204,12 +204,17 @@ class Parts {
   std::vector<uint32_t> parent_;
 };
 
-/// Voxels inside, farthest from the source first; equal ones by index.
+/// Voxels inside, farthest from the source first; equal ones by index. A counting sort, as distances are small numbers.
 std::vector<uint32_t> farthest_first(const Interior& interior, const Geodesics& geodesics) {
-  std::vector<uint32_t> order = interior.inside;
-  std::sort(order.begin(), order.end(), [&](uint32_t a, uint32_t b) {
-    return geodesics.steps[a] != geodesics.steps[b] ? geodesics.steps[a] > geodesics.steps[b] : a < b;
-  });
+  uint32_t farthest = 0;
+  for (const uint32_t v : interior.inside)
+    if (geodesics.steps[v] != Geodesics::unreached) farthest = std::max(farthest, geodesics.steps[v]);
+  const auto rank = [&](uint32_t v) { return farthest + 1 - std::min(geodesics.steps[v], farthest + 1); };
+  std::vector<uint32_t> begin(size_t{farthest} + 3, 0);
+  for (const uint32_t v : interior.inside) ++begin[rank(v) + 1];
+  std::partial_sum(begin.begin(), begin.end(), begin.begin());
+  std::vector<uint32_t> order(interior.inside.size());
+  for (const uint32_t v : interior.inside) order[begin[rank(v)]++] = v;
   return order;
 }
 

@@ -1,9 +1,11 @@
 #include "pipeline/skeleton/skeleton_fit.h"
 
+#include <Eigen/Eigenvalues>
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <initializer_list>
 #include <limits>
 #include <numbers>
 #include <optional>
@@ -18,11 +20,13 @@ using Eigen::Vector3d;
 
 // Proportions of people, as shares of stature unless a comment says otherwise. Lengths between joint centres are the
 // means of de Leva's men and women; heights and breadths are Drillis and Contini's where they give them.
-constexpr double upper_arm_share = 0.150;   // shoulder to elbow; de Leva 0.160, less as stature here has shoes and hair
-constexpr double hand_of_arm = 0.26;        // wrist to fingertip, of shoulder to fingertip
-constexpr double forearm_of_arm = 0.36;     // elbow to wrist, likewise
-constexpr double arm_share = 0.42;          // shoulder to fingertip
-constexpr double longest_arm_share = 0.48;  // what is longer holds something
+constexpr double upper_arm_share = 0.150;  // shoulder to elbow; de Leva 0.160, less as stature here has shoes and hair
+constexpr double forearm_share = 0.146;    // elbow to wrist; de Leva 0.153, less for the same reason
+constexpr double hand_of_arm = 0.27;       // wrist to fingertip, of shoulder to fingertip
+constexpr double forearm_of_arm = 0.36;    // elbow to wrist, likewise
+constexpr double arm_share = 0.42;         // shoulder to fingertip
+constexpr double shortest_arm_share = 0.28;     // what is shorter ends at the elbow
+constexpr double longest_arm_share = 0.48;      // what is longer holds something
 constexpr double shoulder_half_share = 0.105;   // middle to shoulder joint: half the biacromial breadth less 0.01
 constexpr double shoulder_cover_share = 0.031;  // shoulder joint to the skin above and beside it
 constexpr double shoulder_drop_share = 0.055;   // from the lowest joint of the neck down to the shoulder joints
@@ -31,12 +35,16 @@ constexpr double hip_height_share = 0.52;       // of adults
 constexpr double hip_of_crotch = 1.14;          // hip joints' height, of the crotch's
 constexpr double knee_of_leg = 0.51;            // ankle to knee, of ankle to hip
 constexpr double ankle_height_share = 0.043;
-constexpr double foot_share = 0.152;            // length of a foot
-constexpr double ball_of_foot = 0.72;           // ankle to the ball of the foot, of ankle to toe tip
-constexpr double neck_height_share = 0.875;     // narrowest part of the neck
-constexpr double adult_head_share = 0.12;       // narrowest part of the neck to the crown
+constexpr double foot_share = 0.152;          // length of a foot
+constexpr double ball_of_foot = 0.72;         // ankle to the ball of the foot, of ankle to toe tip
+constexpr double neck_height_share = 0.875;   // narrowest part of the neck
+constexpr double adult_head_share = 0.12;     // narrowest part of the neck to the crown
+constexpr double head_front_share = 0.06;     // face to the middle of the head
+constexpr double longest_head_share = 0.135;  // face to the back of the head; what is longer has hair or a hood
+constexpr double shoulder_ahead_share =
+    0.006;  // shoulder joint before the middle of what the shoulder blade makes thick
 constexpr double spine_of_trunk_depth = 0.37;   // the column of vertebrae, from the back
-constexpr double sacrum_of_trunk_depth = 0.25;  // where it stands on the pelvis
+constexpr double sacrum_of_trunk_depth = 0.16;  // where it stands on the pelvis
 constexpr double deepest_trunk_share = 0.18;    // what is deeper is a skirt's or a coat's
 
 enum Side { left = 0, right = 1 };
@@ -73,7 +81,8 @@ struct TrunkJoints {
   Vector3d hips, spine, spine1, spine2, neck, head, crown;
 };
 struct ArmJoints {
-  Vector3d clavicle, shoulder, elbow, wrist, fingers;
+  Vector3d clavicle = Vector3d::Zero(), shoulder = Vector3d::Zero(), elbow = Vector3d::Zero(), wrist = Vector3d::Zero(),
+           fingers = Vector3d::Zero();
 };
 struct LegJoints {
   Vector3d hip, knee, ankle, ball, toes;
@@ -378,7 +387,7 @@ Vector3d shoulder_joint(const Body& body, const std::vector<double>& outline, do
     }
   }
   const double near = 0.02 * body.stature;
-  best.z() = centre_near(body, best, {near, near, body.stature}).z();
+  best.z() = centre_near(body, best, {near, near, body.stature}).z() + shoulder_ahead_share * body.stature;
   return best;
 }
 
@@ -399,7 +408,7 @@ Vector3d point_along(const std::vector<Station>& line, double along) {
   return line.back().p;
 }
 
-/// Where the arm narrows to the wrist, near where its length says; the length's word where it does not narrow.
+/// Where the arm narrows to the wrist, near where its length says: the more clearly it does, the more that counts.
 double wrist_along(const std::vector<Station>& line, double arm_length) {
   const double expected = hand_of_arm * arm_length;
   double palm = 0;
@@ -411,9 +420,15 @@ double wrist_along(const std::vector<Station>& line, double arm_length) {
         (narrowest == 0 || line[s].area_m2 < line[narrowest].area_m2))
       narrowest = s;
   }
-  constexpr double clearly = 0.85;
-  if (narrowest == 0 || line[narrowest].area_m2 > clearly * palm) return expected;
-  return 0.5 * (expected + line[narrowest].along);
+  if (narrowest == 0) return expected;
+  // The lowest point of the parabola through it and its neighbours lies between the stations.
+  const Station &before = line[narrowest - 1], &at = line[narrowest], &after = line[narrowest + 1];
+  const double rise = before.area_m2 - at.area_m2, climb = after.area_m2 - at.area_m2;
+  const double spacing = 0.5 * (after.along - before.along);
+  const double offset = rise + climb > 0 ? 0.5 * (rise - climb) / (rise + climb) * spacing : 0;
+  constexpr double hardly = 0.95, clearly = 0.75;  // narrowest section, of the palm's
+  const double share = 0.5 * std::clamp((hardly - at.area_m2 / palm) / (hardly - clearly), 0.0, 1.0);
+  return (1 - share) * expected + share * (at.along + offset);
 }
 
 /// The bend of the arm: the place E for which the straight pieces wrist–E–shoulder follow the centre line best, weighed
@@ -485,11 +500,15 @@ double shoulder_cover(const Body& body, const std::vector<Station>& line) {
   return 0.5 * usual + 0.5 * std::clamp(radius, 0.015 * body.stature, 0.055 * body.stature);
 }
 
-ArmJoints trace_arm(const Body& body, const std::vector<uint32_t>& limb, const std::vector<double>& outline,
-                    double middle, size_t side, const TrunkJoints& trunk, std::vector<std::string>& warnings) {
+/// The joints along a limb, or nothing where it is too short for an arm: then it is an elbow that sticks out.
+std::optional<ArmJoints> trace_arm(const Body& body, const std::vector<uint32_t>& limb,
+                                   const std::vector<double>& outline, double middle, size_t side,
+                                   const TrunkJoints& trunk, std::vector<std::string>& warnings) {
   std::vector<Station> line = centre_line(body, limb);
   cut_at_trunk(body, line);
   const double cover = shoulder_cover(body, line);
+  const Vector3d shoulder = shoulder_joint(body, outline, cover, middle, side, trunk, std::nullopt);
+  if (line.back().along + (line.back().p - shoulder).norm() < shortest_arm_share * body.stature) return std::nullopt;
   continue_to_elbow(body, line);
   ArmJoints arm;
   arm.fingers = body.interior.point(limb.front());
@@ -516,69 +535,65 @@ ArmJoints trace_arm(const Body& body, const std::vector<uint32_t>& limb, const s
   return arm;
 }
 
-/// The part of an arm between shoulder and hand that stands clear of the trunk seen from the front, from below upwards:
-/// what remains visible when the hand touches the body.
-std::vector<Station> clear_arm(const Body& body, size_t side, double middle, double low, double high) {
-  const Grid& grid = body.interior.grid;
-  std::vector<Station> best, current;
-  for (double y = low; y < high; y += 2 * body.voxel()) {
-    const int j = body.row(y);
-    const auto filled = [&](int i) {
-      for (int k = 0; k < grid.size[2]; ++k)
-        if (body.solid(i, j, k)) return true;
-      return false;
-    };
-    int outermost = side == left ? grid.size[0] - 1 : 0;
-    while (outermost >= 0 && outermost < grid.size[0] && !filled(outermost)) outermost += side == left ? -1 : 1;
-    const Run run = run_at(body, y, grid.point(outermost, 0, 0).x());
-    if (run.empty() || (run.low < middle && run.high > middle)) {
-      current.clear();
-      continue;
-    }
-    const double x = 0.5 * (run.low + run.high);
-    const Vector3d centre = centre_near(body, {x, y, 0}, {0.5 * run.width(), 1.5 * body.voxel(), 10 * body.stature});
-    current.push_back({centre, 0, 0});
-    if (current.size() > best.size()) best = current;
+/// The body's outline on one side seen from the front: how far out it goes, row by row; minus infinity where it is not.
+std::vector<double> outline_aside(const Body& body, size_t side) {
+  std::vector<double> out(static_cast<size_t>(body.interior.grid.size[1]), -std::numeric_limits<double>::infinity());
+  for (const uint32_t v : body.interior.inside) {
+    const auto [i, j, k] = body.interior.cell(v);
+    double& farthest = out[static_cast<size_t>(j)];
+    farthest = std::max(farthest, sign(side) * body.interior.grid.point(i, j, k).x() + 0.5 * body.voxel());
   }
+  return out;
+}
+
+/// A bone that lies along the outline, seen from the front: as long as it should be, and as deep under the outline as
+/// what covers it. Among the directions in which it does, the one nearest to `expected_rad` from straight down is
+/// taken.
+struct BoneAlongOutline {
+  double length = 0, cover = 0;
+  double expected_rad = 0, spread_rad = 1;
+};
+Vector3d end_of(const Body& body, const std::vector<double>& outline, size_t side, const Vector3d& from,
+                const BoneAlongOutline& bone) {
+  const double tolerance = 0.012 * body.stature;
+  constexpr double inmost_rad = -1.3, outmost_rad = 1.5, step_rad = 0.02;
+  constexpr std::array<double, 4> shares{0.4, 0.6, 0.8, 1.0};  // of the bone; what covers its beginning is not known
+  constexpr double worst = 16;  // where it does not fit at all, by how much does not matter
+  double least = std::numeric_limits<double>::infinity();
+  Vector3d best = from - bone.length * Vector3d::UnitY();
+  for (double angle = inmost_rad; angle < outmost_rad; angle += step_rad) {
+    const Vector3d way = bone.length * Vector3d(sign(side) * std::sin(angle), -std::cos(angle), 0);
+    const double unusual = (angle - bone.expected_rad) / bone.spread_rad;
+    double cost = unusual * unusual;
+    for (const double share : shares) {
+      const Vector3d p = from + share * way;
+      const double out = outline[static_cast<size_t>(body.row(p.y()))];
+      const double misfit = (sign(side) * p.x() + bone.cover - out) / tolerance;
+      cost += std::min(worst, misfit * misfit) / static_cast<double>(shares.size());
+    }
+    if (cost < least) {
+      least = cost;
+      best = from + way;
+    }
+  }
+  const double near = 0.015 * body.stature;
+  best.z() = centre_near(body, best, {near, near, body.stature}).z();
   return best;
 }
 
-/// An arm whose hand cannot be told from the body: what stands clear of it is followed, the rest hangs straight down
-/// by proportions.
+/// An arm whose hand cannot be told from the body: it hangs beside it or the hand rests on the hip. Seen from the front
+/// it makes the outline from the shoulder down, so upper arm and forearm are laid along that.
 ArmJoints hidden_arm(const Body& body, const std::vector<double>& outline, double middle, size_t side,
                      const TrunkJoints& trunk) {
-  const double cover = shoulder_cover_share * body.stature;
-  const double length = arm_share * body.stature;
+  const double length = arm_share * body.stature, forearm = forearm_share * body.stature;
+  constexpr double elbow_cover_share = 0.024, wrist_cover_share = 0.02;  // of stature
+  const std::vector<double> aside = outline_aside(body, side);
   ArmJoints arm;
-  arm.shoulder = shoulder_joint(body, outline, cover, middle, side, trunk, std::nullopt);
-  const double near = 0.02 * body.stature;
-  const auto below = [&](double share) {
-    // As far out as the body goes there, less what covers the bone.
-    const double y = arm.shoulder.y() - share * length;
-    const Run run = run_at(body, y, middle);
-    const double x = run.empty() ? arm.shoulder.x() : (side == left ? run.high : run.low) - sign(side) * cover;
-    return Vector3d(x, y, centre_near(body, {x, y, arm.shoulder.z()}, {near, near, body.stature}).z());
-  };
-  const std::vector<Station> clear = clear_arm(body, side, middle, trunk.hips.y(), arm.shoulder.y() - cover);
-  constexpr double enough_share = 0.08;  // clear over less of its length, an arm tells nothing of its bend
-  if (clear.size() < 3 || clear.back().p.y() - clear.front().p.y() < enough_share * body.stature) {
-    arm.elbow = below(1 - hand_of_arm - forearm_of_arm);
-    arm.wrist = below(1 - hand_of_arm);
-    arm.fingers = below(1);
-    return arm;
-  }
-  double seen = (arm.shoulder - clear.back().p).norm();
-  for (size_t s = 1; s < clear.size(); ++s) seen += (clear[s].p - clear[s - 1].p).norm();
-  const Vector3d onwards = (clear[0].p - clear[2].p).normalized();
-  const double hidden = std::max(0.0, length - seen);
-  std::vector<Station> line{{clear[0].p + hidden * onwards, 0, 0}};
-  if (hidden > 0) continue_to(body, clear[0].p, line);
-  for (size_t s = 1; s < clear.size(); ++s) continue_to(body, clear[s].p, line);
-  continue_to(body, arm.shoulder, line);
-  const double wrist = hand_of_arm * line.back().along;
-  arm.fingers = line.front().p;
-  arm.wrist = point_along(line, wrist);
-  arm.elbow = find_elbow(body, line, wrist);
+  arm.shoulder = shoulder_joint(body, outline, shoulder_cover_share * body.stature, middle, side, trunk, std::nullopt);
+  arm.elbow = end_of(body, aside, side, arm.shoulder,
+                     {upper_arm_share * body.stature, elbow_cover_share * body.stature, 0.15, 0.6});
+  arm.wrist = end_of(body, aside, side, arm.elbow, {forearm, wrist_cover_share * body.stature, 0, 0.6});
+  arm.fingers = arm.wrist + hand_of_arm * length * (arm.wrist - arm.elbow).normalized();
   return arm;
 }
 
@@ -639,20 +654,35 @@ double where_legs_meet(const Body& body, const std::vector<Vector3d>& left_rows,
   return body.height(0.6);
 }
 
+/// The ankle over a foot of which only the lowest part can be seen.
+std::optional<Vector3d> ankle_over_foot(const Body& body, const std::vector<uint32_t>& limb, double ankle_y) {
+  Centroid foot;
+  for (const uint32_t v : limb)
+    if (const Vector3d p = body.interior.point(v); p.y() < body.height(0.05)) foot.add(p, 1);
+  if (!(foot.weight > 0)) return std::nullopt;
+  constexpr double behind_middle_share = 0.025;
+  return Vector3d(foot.mean().x(), ankle_y, foot.mean().z() - behind_middle_share * body.stature);
+}
+
 void add_foot(const Body& body, const std::vector<uint32_t>& limb, LegJoints& leg) {
-  // The toes are the voxels of the foot that lie farthest from the ankle towards the front.
-  double farthest = -std::numeric_limits<double>::infinity();
-  for (const uint32_t v : limb) {
-    const Vector3d p = body.interior.point(v);
-    if (p.y() > body.height(0.05)) continue;
-    const Vector3d way = p - leg.ankle;
-    const double reach = Eigen::Vector2d(way.x(), way.z()).norm();
-    if (way.z() > 0.5 * reach && reach > farthest) {
-      farthest = reach;
-      leg.toes = p;
-    }
+  // The foot points from the ankle to the middle of what lies before it; the toes are as far that way as it reaches.
+  Centroid foot;
+  const auto flat = [&](const Vector3d& p) { return Vector3d(p.x() - leg.ankle.x(), 0, p.z() - leg.ankle.z()); };
+  for (const uint32_t v : limb)
+    if (const Vector3d p = body.interior.point(v); p.y() < body.height(0.05) && p.z() > leg.ankle.z())
+      foot.add(flat(p), 1);
+  Vector3d forwards = Vector3d::UnitZ();
+  double reach = 0;
+  constexpr double most_turned = 0.5;  // cosine: feet point to the front
+  if (foot.weight > 0) {
+    const Vector3d middle = foot.mean();
+    if (middle.z() > most_turned * middle.norm()) forwards = middle.normalized();
+    for (const uint32_t v : limb)
+      if (const Vector3d p = body.interior.point(v); p.y() < body.height(0.05))
+        reach = std::max(reach, flat(p).dot(forwards));
   }
-  if (!(farthest > 0)) leg.toes = leg.ankle + Vector3d(0, 0, 0.7 * foot_share * body.stature);
+  const double usual = 0.7 * foot_share * body.stature;
+  leg.toes = leg.ankle + (reach > 0 ? reach : usual) * forwards;
   leg.toes.y() = body.height(0.012);
   leg.ball = leg.ankle + ball_of_foot * (leg.toes - leg.ankle);
   leg.ball.y() = body.height(0.018);
@@ -690,16 +720,16 @@ NeckMeasure find_neck(const Body& body, double x) {
     }
     if (narrowest < 0.85 * head && width > 1.5 * narrowest) break;  // shoulders
   }
-  // The narrowest part is a stretch; take its middle.
-  double sum = 0;
-  int rows = 0;
-  for (double y = neck.y + 0.03 * body.stature; y > neck.y - 0.03 * body.stature; y -= body.voxel())
-    if (run_at(body, y, x).width() < 1.08 * narrowest) {
-      sum += y;
-      ++rows;
+  // The narrowest part is a stretch: take its middle, rows counting the more the narrower they are.
+  constexpr double still_narrow = 1.15;
+  double sum = 0, weight = 0;
+  for (double y = neck.y + 0.05 * body.stature; y > neck.y - 0.05 * body.stature; y -= body.voxel())
+    if (const double width = run_at(body, y, x).width(); width > 0 && width < still_narrow * narrowest) {
+      sum += (still_narrow * narrowest - width) * y;
+      weight += still_narrow * narrowest - width;
     }
-  neck.seen = narrowest < 0.85 * head && rows > 0;
-  neck.y = neck.seen ? sum / rows : body.height(neck_height_share);
+  neck.seen = narrowest < 0.85 * head && weight > 0;
+  neck.y = neck.seen ? sum / weight : body.height(neck_height_share);
   return neck;
 }
 
@@ -713,16 +743,22 @@ double hip_height(const Body& body, const NeckMeasure& neck, std::optional<doubl
   if (!crotch) return body.height(usual);
   const double crotch_height = *crotch - body.floor;
   const double measured = hip_of_crotch * crotch_height / body.stature;
-  if (measured < usual - 0.06) {
-    warnings.emplace_back("the legs are one down to " + std::to_string(std::lround(100 * crotch_height)) +
-                          " cm (a skirt?); the hips were placed by proportions");
-    return body.height(usual);
-  }
   if (measured > 0.58) {
     warnings.emplace_back("no crotch was found; the hips were placed by proportions");
     return body.height(usual);
   }
-  return body.height(0.7 * measured + 0.3 * usual);
+  // Clothes and what no camera can look behind make the crotch too low, nothing makes it too high: the lower, the less
+  // it says, unless the head tells nothing of the proportions.
+  constexpr double measured_share = 0.7, usual_drop = 0.01;
+  const double spread = neck.seen ? 0.02 : 0.05;
+  const double drop = usual - measured;
+  const double beyond = std::max(0.0, drop - usual_drop) / spread;
+  const double share = measured_share * std::exp(-beyond * beyond);
+  constexpr double doubtful_drop = 0.045;
+  if (drop > doubtful_drop)
+    warnings.emplace_back("the legs are one down to " + std::to_string(std::lround(100 * crotch_height)) +
+                          " cm (a skirt, or too few cameras?); the hips were placed by proportions");
+  return body.height(share * measured + (1 - share) * usual);
 }
 
 TrunkJoints place_trunk(const Body& body, const Ends& ends, const NeckMeasure& neck, double head_x, double hip_y,
@@ -731,9 +767,12 @@ TrunkJoints place_trunk(const Body& body, const Ends& ends, const NeckMeasure& n
   const double head_height = body.height(1) - neck.y;
   TrunkJoints trunk;
 
-  const Vector3d skull =
+  Vector3d skull =
       centre_near(body, {head_x, body.height(1) - 0.4 * head_height, 0.5 * (body.interior.point(ends.head).z())},
                   {0.08 * h, 0.25 * head_height, h});
+  // Hair hides where the head ends behind, not where the face is.
+  const Run head = depth_run(body, head_x, skull.y(), 0.02 * h, 0.02 * h);
+  if (head.width() > longest_head_share * h) skull.z() = head.high - head_front_share * h;
   const auto spine_at = [&](double y, double x, double of_depth) {
     const Run run = depth_run(body, x, y, 0.02 * h, 0.015 * h);
     const double depth = std::min(run.width(), deepest_trunk_share * h);
@@ -752,7 +791,8 @@ TrunkJoints place_trunk(const Body& body, const Ends& ends, const NeckMeasure& n
   trunk.spine1 = trunk_at(0.30);
   trunk.spine2 = trunk_at(0.62);
   trunk.head = {skull.x(), neck.y + 0.22 * head_height, skull.z() - 0.01 * h};
-  const Vector3d throat = centre_near(body, {x_at(neck_y), neck_y, skull.z()}, {0.03 * h, 0.015 * h, h});
+  Vector3d throat = centre_near(body, {x_at(neck_y), neck_y, skull.z()}, {0.03 * h, 0.015 * h, h});
+  if (!neck.seen) throat.z() = std::max(throat.z(), skull.z() - 0.02 * h);
   trunk.neck = {0.5 * (throat.x() + x_at(neck_y)), neck_y,
                 0.5 * throat.z() + 0.25 * (trunk.spine2.z() + trunk.head.z())};
   trunk.crown = {skull.x(), body.height(1) - 0.01 * h, skull.z()};
@@ -850,24 +890,6 @@ Result<Subject> find_subject(const Mesh& mesh, const SkeletonOptions& options) {
   return subject;
 }
 
-/// By how much the person is turned about the vertical away from facing +Z; 0 unless hands and feet agree on it.
-double turn_of(const Subject& subject) {
-  const Ends& ends = subject.ends;
-  if (!ends.hand[left] || !ends.hand[right] || !ends.foot[left]) return 0;
-  const auto turn = [&](size_t left_tip, size_t right_tip) {
-    const Vector3d across = subject.body.interior.point(left_tip) - subject.body.interior.point(right_tip);
-    return std::atan2(-across.z(), across.x());
-  };
-  const double hands = turn(*ends.hand[left], *ends.hand[right]), feet = turn(*ends.foot[left], *ends.foot[right]);
-  constexpr double agreement = 0.2;  // radians; a step forward turns the feet alone
-  return std::abs(hands - feet) < agreement ? 0.5 * (hands + feet) : 0;
-}
-
-Mesh turned(Mesh mesh, const Eigen::Isometry3d& turn) {
-  for (auto& p : mesh.positions) p = (turn * p.cast<double>()).cast<float>();
-  return mesh;
-}
-
 std::array<LegJoints, 2> place_legs(const Body& body, const std::array<std::vector<Vector3d>, 2>& rows,
                                     const std::array<std::vector<uint32_t>, 2>& limbs, const TrunkJoints& trunk,
                                     std::vector<std::string>& warnings) {
@@ -881,10 +903,12 @@ std::array<LegJoints, 2> place_legs(const Body& body, const std::array<std::vect
     LegJoints& leg = legs[side];
     const Vector3d usual_hip = trunk.pelvis + Vector3d(sign(side) * hip_half_share * body.stature, 0, 0);
     const auto ankle = extrapolate(rows[side], body.height(0.08), body.height(0.14), ankle_y);
-    leg.ankle = ankle.value_or(Vector3d(usual_hip.x(), ankle_y, usual_hip.z()));
+    leg.ankle = ankle.value_or(
+        ankle_over_foot(body, limbs[side], ankle_y).value_or(Vector3d(usual_hip.x(), ankle_y, usual_hip.z())));
     leg.hip = usual_hip;
+    constexpr double usual_breadth = 0.7;  // where the thighs widen, their middles say little of the joints
     if (const auto axis = extrapolate(rows[side], knee_y, body.height(1), hip_y))
-      leg.hip.x() = 0.5 * (usual_hip.x() + axis->x());
+      leg.hip.x() = usual_breadth * usual_hip.x() + (1 - usual_breadth) * axis->x();
     leg.hip.z() = 0.7 * trunk.pelvis.z() + 0.3 * leg.ankle.z();
     const auto knee = extrapolate(rows[side], knee_y - near, knee_y + near, knee_y);
     leg.knee = knee.value_or(leg.ankle + knee_of_leg * (leg.hip - leg.ankle));
@@ -900,13 +924,12 @@ std::array<ArmJoints, 2> place_arms(const Body& body, const std::array<std::vect
   const double middle = trunk.neck.x();
   for (const size_t side : {left, right}) {
     ArmJoints& arm = arms[side];
-    if (!limbs[side].empty()) {
-      arm = trace_arm(body, limbs[side], outline, middle, side, trunk, warnings);
-    } else {
-      arm = hidden_arm(body, outline, middle, side, trunk);
+    std::optional<ArmJoints> traced;
+    if (!limbs[side].empty()) traced = trace_arm(body, limbs[side], outline, middle, side, trunk, warnings);
+    arm = traced ? *traced : hidden_arm(body, outline, middle, side, trunk);
+    if (!traced)
       warnings.push_back(std::string("the ") + name(side) +
-                         " hand cannot be told from the body; the arm was placed by proportions");
-    }
+                         " hand cannot be told from the body; the arm was placed by outline and proportions");
     arm.clavicle = {middle + sign(side) * 0.018 * body.stature,
                     arm.shoulder.y() + 0.3 * (trunk.neck.y() - arm.shoulder.y()),
                     0.5 * (trunk.neck.z() + arm.shoulder.z())};
@@ -914,10 +937,62 @@ std::array<ArmJoints, 2> place_arms(const Body& body, const std::array<std::vect
   return arms;
 }
 
-FittedSkeleton place_joints(const Subject& subject) {
+/// Where all joints are, and what could not be seen.
+struct PlacedJoints {
+  TrunkJoints trunk;
+  std::array<ArmJoints, 2> arms;
+  std::array<LegJoints, 2> legs;
+  std::vector<std::string> warnings;
+};
+
+/// Moves a joint along its bone until that has the length, and what hangs from it too.
+void set_length(const Vector3d& from, double length, Vector3d& joint, std::initializer_list<Vector3d*> below) {
+  const Vector3d bone = joint - from;
+  if (!(bone.norm() > 0)) return;
+  const Vector3d step = (length / bone.norm() - 1) * bone;
+  joint += step;
+  for (Vector3d* p : below) *p += step;
+}
+
+/// The length that both sides' bones are given: people are symmetric, so the sides' mean; where they differ a lot, the
+/// one that is nearer to the usual, as the other was hidden or mistaken.
+double agreed_length(double left_m, double right_m, double usual_m) {
+  constexpr double similar = 0.12;
+  if (std::abs(left_m - right_m) < similar * (left_m + right_m) / 2) return 0.5 * (left_m + right_m);
+  return std::abs(left_m - usual_m) < std::abs(right_m - usual_m) ? left_m : right_m;
+}
+
+void make_symmetric(const Body& body, PlacedJoints& joints) {
+  const double h = body.stature;
+  std::array<ArmJoints, 2>& arms = joints.arms;
+  const auto length = [](const Vector3d& a, const Vector3d& b) { return (a - b).norm(); };
+  const double upper = agreed_length(length(arms[left].shoulder, arms[left].elbow),
+                                     length(arms[right].shoulder, arms[right].elbow), upper_arm_share * h);
+  const double lower = agreed_length(length(arms[left].elbow, arms[left].wrist),
+                                     length(arms[right].elbow, arms[right].wrist), forearm_share * h);
+  for (ArmJoints& arm : arms) {
+    set_length(arm.shoulder, upper, arm.elbow, {&arm.wrist, &arm.fingers});
+    set_length(arm.elbow, lower, arm.wrist, {&arm.fingers});
+  }
+  std::array<LegJoints, 2>& legs = joints.legs;
+  const double leg_share = 0.5 * (hip_height_share - ankle_height_share);
+  const double thigh =
+      agreed_length(length(legs[left].hip, legs[left].knee), length(legs[right].hip, legs[right].knee), leg_share * h);
+  const double shin = agreed_length(length(legs[left].knee, legs[left].ankle),
+                                    length(legs[right].knee, legs[right].ankle), leg_share * h);
+  for (LegJoints& leg : legs) {
+    // From the ankle upwards: the feet stand where they stand.
+    const Vector3d knee = leg.knee;
+    set_length(leg.ankle, shin, leg.knee, {});
+    leg.hip += leg.knee - knee;
+    set_length(leg.knee, thigh, leg.hip, {});
+  }
+}
+
+PlacedJoints place_joints(const Subject& subject) {
   const Body& body = subject.body;
   const Ends& ends = subject.ends;
-  FittedSkeleton result;
+  PlacedJoints result;
 
   std::vector<size_t> tips{ends.head};
   for (const auto& pair : {ends.hand, ends.foot})
@@ -951,20 +1026,91 @@ FittedSkeleton place_joints(const Subject& subject) {
     hip_x = 0.5 * (std::max(run.low, head_x - half) + std::min(run.high, head_x + half));
   }
 
-  TrunkJoints trunk = place_trunk(body, ends, neck, head_x, hip_y, hip_x);
-  std::array<LegJoints, 2> legs = place_legs(body, rows, leg_limbs, trunk, result.warnings);
-  std::array<ArmJoints, 2> arms = place_arms(body, arm_limbs, trunk, result.warnings);
+  TrunkJoints& trunk = result.trunk;
+  trunk = place_trunk(body, ends, neck, head_x, hip_y, hip_x);
+  result.legs = place_legs(body, rows, leg_limbs, trunk, result.warnings);
+  result.arms = place_arms(body, arm_limbs, trunk, result.warnings);
+  make_symmetric(body, result);
 
   for (Vector3d* p : {&trunk.hips, &trunk.spine, &trunk.spine1, &trunk.spine2, &trunk.neck, &trunk.head, &trunk.crown})
     *p = pulled_inside(body, *p);
   for (const size_t side : {left, right}) {
-    ArmJoints& arm = arms[side];
-    LegJoints& leg = legs[side];
+    ArmJoints& arm = result.arms[side];
+    LegJoints& leg = result.legs[side];
     for (Vector3d* p :
          {&arm.clavicle, &arm.shoulder, &arm.elbow, &arm.wrist, &leg.hip, &leg.knee, &leg.ankle, &leg.ball})
       *p = pulled_inside(body, *p);
   }
-  result.skeleton = build(trunk, arms, legs);
+  return result;
+}
+
+// ---- the person's own axes -----------------------------------------------------------------------------------------
+
+/// The rotation to axes of which y runs along `up` and x as near to `across` as that leaves it.
+Eigen::Matrix3d facing_from_world(const Vector3d& up, const Vector3d& across) {
+  Eigen::Matrix3d rotation;
+  rotation.row(1) = up.normalized();
+  rotation.row(0) = (across - across.dot(rotation.row(1)) * rotation.row(1).transpose()).normalized();
+  rotation.row(2) = rotation.row(0).cross(rotation.row(1));
+  return rotation;
+}
+
+/// Whether these may be the axes of a person who stands facing about +Z.
+bool plausible(const Eigen::Matrix3d& rotation) {
+  constexpr double largest_tilt_rad = 0.3, largest_turn_rad = 0.9;
+  return rotation(1, 1) > std::cos(largest_tilt_rad) && rotation(0, 0) > std::cos(largest_turn_rad);
+}
+
+/// The axes of the mass: a standing person is tallest along the first and, arms included, broadest along the second.
+/// They turn exactly as the body does, however it stands.
+Eigen::Matrix3d axes_of_mass(const Mesh& mesh) {
+  Vector3d origin = Vector3d::Zero();
+  for (const auto& p : mesh.positions) origin += p.cast<double>() / static_cast<double>(mesh.positions.size());
+  double volume = 0;
+  Vector3d first = Vector3d::Zero();
+  Eigen::Matrix3d second = Eigen::Matrix3d::Zero();
+  for (const auto& t : mesh.triangles) {
+    const Vector3d a = mesh.positions[t[0]].cast<double>() - origin, b = mesh.positions[t[1]].cast<double>() - origin,
+                   c = mesh.positions[t[2]].cast<double>() - origin;
+    const double six_volumes = a.dot(b.cross(c));
+    const Vector3d sum = a + b + c;
+    volume += six_volumes / 6;
+    first += six_volumes / 24 * sum;
+    second += six_volumes / 120 * (a * a.transpose() + b * b.transpose() + c * c.transpose() + sum * sum.transpose());
+  }
+  if (!(volume > 0)) return Eigen::Matrix3d::Identity();
+  const Eigen::Matrix3d covariance = second / volume - first * first.transpose() / (volume * volume);
+  const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> axes(covariance);  // ascending
+  constexpr double clearly = 1.4;  // ratio of the variances, below which an axis is not to be told from the next
+  Vector3d up = Vector3d::UnitY(), across = Vector3d::UnitX();
+  if (axes.eigenvalues()[2] > clearly * axes.eigenvalues()[1]) up = axes.eigenvectors().col(2);
+  if (axes.eigenvalues()[1] > clearly * axes.eigenvalues()[0]) across = axes.eigenvectors().col(1);
+  if (up.y() < 0) up = -up;
+  if (across.x() < 0) across = -across;
+  const Eigen::Matrix3d rotation = facing_from_world(up, across);
+  return plausible(rotation) ? rotation : Eigen::Matrix3d::Identity();
+}
+
+/// The person's own axes from the joints: up from the ankles to the neck, across as hands, feet and shoulders have it
+/// in their majority, as a step or a raised arm turns one of them alone.
+Eigen::Matrix3d axes_of_joints(const PlacedJoints& joints, const Ends& ends) {
+  const auto turn = [](const Vector3d& of_left, const Vector3d& of_right) {
+    const Vector3d across = of_left - of_right;
+    return std::atan2(-across.z(), across.x());
+  };
+  std::vector<double> turns{turn(joints.arms[left].shoulder, joints.arms[right].shoulder)};
+  if (ends.hand[left] && ends.hand[right]) turns.push_back(turn(joints.arms[left].wrist, joints.arms[right].wrist));
+  if (ends.foot[left]) turns.push_back(turn(joints.legs[left].ankle, joints.legs[right].ankle));
+  std::sort(turns.begin(), turns.end());
+  const double middle = turns.size() == 2 ? 0.5 * (turns[0] + turns[1]) : turns[turns.size() / 2];
+  const Vector3d up = joints.trunk.neck - 0.5 * (joints.legs[left].ankle + joints.legs[right].ankle);
+  const Eigen::Matrix3d rotation = facing_from_world(up, {std::cos(middle), 0, -std::sin(middle)});
+  return plausible(rotation) ? rotation : Eigen::Matrix3d::Identity();
+}
+
+Mesh turned(const Mesh& mesh, const Eigen::Matrix3d& rotation) {
+  Mesh result = mesh;
+  for (auto& p : result.positions) p = (rotation * p.cast<double>()).cast<float>();
   return result;
 }
 
@@ -975,22 +1121,23 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
     return Error{ErrorCode::invalid_argument,
                  "skeleton.cells: " + std::to_string(options.cells) + ", expected 100 … 400"};
   if (const auto checked = check(mesh); !checked) return checked.error();
-  auto subject = find_subject(mesh, options);
+
+  // First coarsely along the axes of the mass, which gives the person's own axes; then finely along these.
+  Eigen::Matrix3d rotation = axes_of_mass(mesh);
+  constexpr int coarse_cells = 100;
+  const auto coarse = find_subject(turned(mesh, rotation), {.cells = coarse_cells});
+  if (work.stopped()) return Work::cancelled();
+  rotation = coarse ? (axes_of_joints(place_joints(*coarse), coarse->ends) * rotation).eval()
+                    : Eigen::Matrix3d::Identity().eval();
+  work.report(0.2);
+  const auto subject = find_subject(turned(mesh, rotation), options);
   if (!subject) return subject.error();
   if (work.stopped()) return Work::cancelled();
+  PlacedJoints joints = place_joints(*subject);
 
-  // Who stands turned is measured facing +Z and turned back.
-  Eigen::Isometry3d world_from_facing = Eigen::Isometry3d::Identity();
-  constexpr double noticeable_turn = 0.15, largest_turn = 0.9;  // radians
-  if (const double turn = turn_of(*subject); std::abs(turn) > noticeable_turn && std::abs(turn) < largest_turn) {
-    world_from_facing.rotate(Eigen::AngleAxisd(turn, Vector3d::UnitY()));
-    subject = find_subject(turned(mesh, world_from_facing.inverse()), options);
-    if (!subject) return subject.error();
-    if (work.stopped()) return Work::cancelled();
-  }
-  FittedSkeleton result = place_joints(*subject);
+  FittedSkeleton result{build(joints.trunk, joints.arms, joints.legs), std::move(joints.warnings)};
   Joint& root = result.skeleton.joints.front();
-  root.parent_from_joint = world_from_facing * root.parent_from_joint;
+  root.parent_from_joint = Eigen::Isometry3d(Eigen::Quaterniond(rotation.transpose())) * root.parent_from_joint;
   work.report(1);
   return result;
 }

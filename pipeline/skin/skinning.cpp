@@ -102,6 +102,21 @@ void add_jaw(const Skeleton& skeleton, const std::vector<Eigen::Isometry3d>& wor
       {base.translation(), base * Vector3d(0, -down * length, forward * length), static_cast<size_t>(head)});
 }
 
+/// The heel goes with the foot, though it lies below the end of the shin: a second bone of the foot runs down to it.
+void add_heels(const Skeleton& skeleton, const std::vector<Eigen::Isometry3d>& world, std::vector<Bone>& bones) {
+  constexpr double backwards = 0.45;  // of the way from the ankle forwards to the ball of the foot
+  for (const std::string side : {"Left", "Right"}) {
+    const int shin = skeleton.find(side + "Leg"), foot = skeleton.find(side + "Foot"),
+              ball = skeleton.find(side + "ToeBase");
+    if (shin < 0 || foot < 0 || ball < 0) continue;
+    const Vector3d ankle = world[static_cast<size_t>(foot)].translation();
+    const Vector3d down = (ankle - world[static_cast<size_t>(shin)].translation()).normalized();
+    const Vector3d way = world[static_cast<size_t>(ball)].translation() - ankle;
+    const Vector3d forwards = way - way.dot(down) * down;
+    bones.push_back({ankle, ankle + way.dot(down) * down - backwards * forwards, static_cast<size_t>(foot)});
+  }
+}
+
 /// A vertex's bone and how far away that is.
 struct Attachment {
   size_t joint = 0;
@@ -268,6 +283,7 @@ Result<Skin> compute_skin(const Mesh& mesh, const Skeleton& skeleton, const Skin
   if (bones.empty()) return Error{ErrorCode::invalid_argument, "skin: the skeleton has no bones"};
   shape_trunk(skeleton, world, bones);
   add_jaw(skeleton, world, bones);
+  add_heels(skeleton, world, bones);
   const std::vector<Attachment> attachments = attach(mesh, interior, bones, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.3);
