@@ -55,8 +55,8 @@ std::vector<Frame> background_of(const std::string& camera, std::span<const Fram
 
 /// Segments every camera that can be; a camera that cannot is left out and said in the warnings. When nothing is
 /// left, the first camera's reason is the error.
-Result<SegmentedViews> segment_all(const CaptureFrames& capture, const SegmentationOptions& options, const Work& work) {
-  const std::vector<Frame>& frames = capture.body.frames;
+Result<SegmentedViews> segment_all(const CaptureFrames& capture, std::span<const Frame> frames,
+                                   const SegmentationOptions& options, const Work& work) {
   std::vector<std::optional<Result<Segmentation>>> results(frames.size());
   const Work inside{.stop = work.stop, .progress = {}, .parallel = work.parallel};
   work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
@@ -67,6 +67,12 @@ Result<SegmentedViews> segment_all(const CaptureFrames& capture, const Segmentat
   if (work.stopped()) return Work::cancelled();
 
   SegmentedViews views;
+  for (const RigCamera& camera : capture.rig.cameras) {
+    const auto of_camera = [&](const Frame& frame) { return frame.camera == camera.id; };
+    if (camera.role == CameraRole::body && std::none_of(frames.begin(), frames.end(), of_camera))
+      views.warnings.push_back("camera " + camera.id +
+                               " has no picture of the subject; the avatar was made without it");
+  }
   std::optional<Error> first_error;
   for (size_t i = 0; i < frames.size(); ++i) {
     Result<Segmentation>& result = *results[i];
@@ -138,11 +144,14 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
   if (const auto checked = check(capture.rig); !checked) return checked.error();
   Reconstruction result;
   std::vector<std::string>& warnings = result.warnings;
+  // The order in which cameras delivered is chance.
+  std::vector<Frame> frames = capture.body.frames;
+  std::sort(frames.begin(), frames.end(), [](const Frame& a, const Frame& b) { return a.camera < b.camera; });
 
   SegmentedViews views;
   {
     const StageReport report("segmentation", work, progress);
-    auto segmented = segment_all(capture, options.segmentation, report.work());
+    auto segmented = segment_all(capture, frames, options.segmentation, report.work());
     if (!segmented) return segmented.error();
     views = std::move(*segmented);
     warnings = std::move(views.warnings);
@@ -173,8 +182,8 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
 
   {
     const StageReport report("atlas", work, progress);
-    auto textured = build_texture_atlas(avatar.mesh, capture.rig, capture.body.frames, views.silhouettes, options.atlas,
-                                        report.work());
+    auto textured =
+        build_texture_atlas(avatar.mesh, *hull.rig, frames, views.silhouettes, options.atlas, report.work());
     if (!textured) return textured.error();
     avatar.atlas = std::move(textured->atlas);
     warnings.insert(warnings.end(), textured->warnings.begin(), textured->warnings.end());

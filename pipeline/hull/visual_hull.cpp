@@ -4,9 +4,11 @@
 #include <cmath>
 #include <limits>
 #include <memory>
+#include <sstream>
 #include <string>
 
 #include "pipeline/geometry/silhouette_view.h"
+#include "pipeline/hull/camera_alignment.h"
 #include "pipeline/hull/contradictions.h"
 #include "pipeline/hull/solid_parts.h"
 
@@ -271,11 +273,13 @@ Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette>
                                      const VisualHullOptions& options, const Work& work) {
   if (auto fine = check_input(rig, silhouettes, options); !fine) return fine.error();
 
-  SilhouetteViews views = make_views(rig, silhouettes, work);
+  VisualHull hull;
+  const auto own_rig = std::make_shared<Rig>(rig);
+  hull.rig = own_rig;
+  SilhouetteViews views = make_views(*own_rig, silhouettes, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.3);
 
-  VisualHull hull;
   std::erase_if(views, [&](const std::unique_ptr<SilhouetteView>& view) {
     const bool blind = view->outline().content() == OutlineDistance::Content::no_subject;
     const std::string& id = view->camera().id;
@@ -295,15 +299,30 @@ Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette>
   };
   carve();
   work.report(0.7);
-  // A camera that alone denies what all others see is overruled there; then the hull is carved anew.
-  const std::vector<Contradiction> contradictions = find_contradictions(rig.volume, views, hull.field, work);
-  if (!contradictions.empty() && !work.stopped()) {
-    for (const Contradiction& contradiction : contradictions) {
-      auto& view = views[contradiction.view];
+  const std::vector<Realignment> realignments = realign_cameras(*own_rig, views, hull.field, work);
+  for (const auto& [view, offset_px] : realignments) {
+    std::ostringstream text;
+    text.precision(2);
+    text << "the picture of camera " << views[view]->camera().id << " is off by " << offset_px
+         << " pixels from where the other cameras expect it; it was realigned, calibrate it anew";
+    hull.warnings.push_back(text.str());
+  }
+  if (!realignments.empty() && !work.stopped()) carve();
+  // Where a mask lacks a part, others may seem to lack something behind it: the worst is overruled first, and the
+  // others are looked at anew.
+  std::vector<bool> named(views.size());
+  for (size_t round = 0; round < views.size() && !work.stopped(); ++round) {
+    const std::vector<Contradiction> contradictions = find_contradictions(rig.volume, views, hull.field, work);
+    const auto worst = std::max_element(
+        contradictions.begin(), contradictions.end(),
+        [](const Contradiction& a, const Contradiction& b) { return a.discs.size() < b.discs.size(); });
+    if (worst == contradictions.end()) break;
+    auto& view = views[worst->view];
+    if (!named[worst->view])
       hull.warnings.push_back("the silhouette of camera " + view->camera().id +
                               " lacks a part of the subject that the other cameras see; it was overruled there");
-      view = std::make_unique<SilhouetteView>(view->camera(), overrule(view->coverage(), contradiction));
-    }
+    named[worst->view] = true;
+    view = std::make_unique<SilhouetteView>(view->camera(), overrule(view->coverage(), *worst));
     carve();
   }
   if (work.stopped()) return Work::cancelled();

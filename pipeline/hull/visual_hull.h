@@ -1,5 +1,6 @@
 #pragma once
 
+#include <memory>
 #include <span>
 #include <string>
 #include <vector>
@@ -19,8 +20,9 @@ struct VisualHullOptions {
 
 struct VisualHull {
   Field field;  ///< metres where stored, cut off at two voxels; negative inside, positive on the grid's border
-  SilhouetteViews
-      views;  ///< the silhouettes that it explains: overruled where a camera was; of cameras in the rig given
+  /// The rig given, with the principal points of cameras moved that do not agree with the others.
+  std::shared_ptr<const Rig> rig;
+  SilhouetteViews views;  ///< the silhouettes that it explains: overruled where a camera was; of cameras in `rig`
   std::vector<std::string> cameras;   ///< ids of the cameras that were used
   std::vector<std::string> warnings;  ///< sentences for an operator
 };
@@ -28,8 +30,9 @@ struct VisualHull {
 /// The largest solid that fits inside every silhouette and inside rig.volume: one connected body without cavities.
 ///
 /// A camera has a say only about points inside its image; where its silhouette is cut off by the image's border, its
-/// say fades towards the cut. Silhouettes without any subject are left out; where a camera alone denies what all
-/// others see, it is overruled (see contradictions.h). Both with a warning that names the camera.
+/// say fades towards the cut. Silhouettes without any subject are left out; a camera that was moved since its
+/// calibration is realigned (see camera_alignment.h); where a camera alone denies what all others see, it is overruled
+/// (see contradictions.h). Each with a warning that names the camera.
 ///
 /// @param rig          world frame; only cameras that have a silhouette are used
 /// @param silhouettes  at most one a camera, distorted pixels, as captured; the size of the camera's image

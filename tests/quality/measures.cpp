@@ -5,7 +5,11 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <fstream>
 #include <limits>
+#include <random>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "pipeline/geometry/camera_model.h"
@@ -38,6 +42,8 @@ Eigen::Vector3d sample_linear(const Image& image, const Eigen::Vector2f& uv) {
 }  // namespace
 
 struct RayCaster::Scene {
+  explicit Scene(const Mesh& shape) : mesh(shape) {}
+  Mesh mesh;
   RTCDevice device = rtcNewDevice("threads=1");
   RTCScene scene = rtcNewScene(device);
   ~Scene() {
@@ -46,7 +52,7 @@ struct RayCaster::Scene {
   }
 };
 
-RayCaster::RayCaster(const Mesh& mesh) : scene_(std::make_unique<Scene>()) {
+RayCaster::RayCaster(const Mesh& mesh) : scene_(std::make_unique<Scene>(mesh)) {
   RTCGeometry geometry = rtcNewGeometry(scene_->device, RTC_GEOMETRY_TYPE_TRIANGLE);
   void* positions = rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 3 * sizeof(float),
                                             mesh.positions.size());
@@ -79,6 +85,139 @@ std::optional<Hit> RayCaster::cast(const Eigen::Vector3d& origin, const Eigen::V
   rtcIntersect1(scene_->scene, &context, &ray);
   if (ray.hit.geomID == RTC_INVALID_GEOMETRY_ID) return std::nullopt;
   return Hit{ray.hit.primID, {1 - ray.hit.u - ray.hit.v, ray.hit.u, ray.hit.v}};
+}
+
+namespace {
+
+/// The point of a triangle next to p (C. Ericson, "Real-Time Collision Detection", 5.1.5).
+Eigen::Vector3f nearest_on_triangle(const Eigen::Vector3f& p, const Eigen::Vector3f& a, const Eigen::Vector3f& b,
+                                    const Eigen::Vector3f& c) {
+  const Eigen::Vector3f ab = b - a, ac = c - a, ap = p - a, bp = p - b, cp = p - c;
+  const float d1 = ab.dot(ap), d2 = ac.dot(ap), d3 = ab.dot(bp), d4 = ac.dot(bp), d5 = ab.dot(cp), d6 = ac.dot(cp);
+  if (d1 <= 0 && d2 <= 0) return a;
+  if (d3 >= 0 && d4 <= d3) return b;
+  if (d6 >= 0 && d5 <= d6) return c;
+  const float vc = d1 * d4 - d3 * d2, vb = d5 * d2 - d1 * d6, va = d3 * d6 - d5 * d4;
+  if (vc <= 0 && d1 >= 0 && d3 <= 0) return a + d1 / (d1 - d3) * ab;
+  if (vb <= 0 && d2 >= 0 && d6 <= 0) return a + d2 / (d2 - d6) * ac;
+  if (va <= 0 && d4 >= d3 && d5 >= d6) return b + (d4 - d3) / ((d4 - d3) + (d5 - d6)) * (c - b);
+  const float sum = va + vb + vc;
+  return a + vb / sum * ab + vc / sum * ac;
+}
+
+}  // namespace
+
+double RayCaster::distance_m(const Eigen::Vector3d& p) const {
+  struct Nearest {
+    const Mesh& mesh;
+    Eigen::Vector3f point;
+    float distance;
+  } nearest{scene_->mesh, p.cast<float>(), std::numeric_limits<float>::infinity()};
+  RTCPointQuery query{};
+  query.x = nearest.point.x();
+  query.y = nearest.point.y();
+  query.z = nearest.point.z();
+  query.radius = std::numeric_limits<float>::infinity();
+  RTCPointQueryContext context;
+  rtcInitPointQueryContext(&context);
+  const auto look = [](RTCPointQueryFunctionArguments* arguments) {
+    auto* found = static_cast<Nearest*>(arguments->userPtr);
+    const auto& [a, b, c] = found->mesh.triangles[arguments->primID];
+    const auto& at = found->mesh.positions;
+    const float distance = (nearest_on_triangle(found->point, at[a], at[b], at[c]) - found->point).norm();
+    if (distance >= found->distance) return false;
+    found->distance = arguments->query->radius = distance;
+    return true;
+  };
+  rtcPointQuery(scene_->scene, &query, &context, look, &nearest);
+  return static_cast<double>(nearest.distance);
+}
+
+Mesh read_ply(const std::filesystem::path& file) {
+  std::ifstream stream(file, std::ios::binary);
+  stream.exceptions(std::ios::failbit | std::ios::badbit);
+  size_t vertices = 0, faces = 0, colour_bytes = 0;
+  for (std::string line; line != "end_header";) {
+    std::getline(stream, line);
+    if (line.rfind("element vertex ", 0) == 0) vertices = std::stoul(line.substr(15));
+    if (line.rfind("element face ", 0) == 0) faces = std::stoul(line.substr(13));
+    if (line.rfind("property uchar ", 0) == 0) ++colour_bytes;
+  }
+  Mesh mesh;
+  mesh.positions.resize(vertices);
+  std::array<char, 16> skipped{};
+  if (colour_bytes > skipped.size()) throw std::runtime_error(file.string() + ": too many properties");
+  for (Eigen::Vector3f& p : mesh.positions) {
+    stream.read(reinterpret_cast<char*>(p.data()), 3 * sizeof(float));
+    stream.read(skipped.data(), static_cast<std::streamsize>(colour_bytes));
+  }
+  mesh.triangles.resize(faces);
+  for (auto& triangle : mesh.triangles) {
+    if (stream.get() != 3) throw std::runtime_error(file.string() + ": a face is no triangle");
+    stream.read(reinterpret_cast<char*>(triangle.data()), sizeof(triangle));
+  }
+  return mesh;
+}
+
+std::vector<Eigen::Vector3d> sample_surface(const Mesh& mesh, size_t count) {
+  std::vector<double> area_up_to;
+  double area = 0;
+  for (const auto& [a, b, c] : mesh.triangles) {
+    const Eigen::Vector3d ab = (mesh.positions[b] - mesh.positions[a]).cast<double>();
+    area_up_to.push_back(area += ab.cross((mesh.positions[c] - mesh.positions[a]).cast<double>()).norm());
+  }
+  std::mt19937 random(1);
+  const auto share = [&random] { return static_cast<double>(random()) / 4294967296.0; };
+  std::vector<Eigen::Vector3d> points;
+  for (size_t n = 0; n < count; ++n) {
+    // Strata of equal area, a point somewhere in each.
+    const double at = (static_cast<double>(n) + share()) / static_cast<double>(count) * area;
+    const auto found = std::lower_bound(area_up_to.begin(), area_up_to.end(), at);
+    const auto& [a, b, c] = mesh.triangles[static_cast<size_t>(found - area_up_to.begin())];
+    const double root = std::sqrt(share()), v = share();
+    points.push_back((1 - root) * mesh.positions[a].cast<double>() + root * (1 - v) * mesh.positions[b].cast<double>() +
+                     root * v * mesh.positions[c].cast<double>());
+  }
+  return points;
+}
+
+std::vector<Eigen::Vector3d> seen_points(std::span<const Eigen::Vector3d> points, const RayCaster& caster,
+                                         const Rig& rig) {
+  constexpr double self_m = 1e-3;  // a ray starts so far off the surface
+  std::vector<Eigen::Vector3d> seen;
+  for (const Eigen::Vector3d& p : points) {
+    const bool by_any = std::any_of(rig.cameras.begin(), rig.cameras.end(), [&](const RigCamera& camera) {
+      const auto pixel = project(camera, p);
+      if (!pixel) return false;
+      const Eigen::Vector2d at = *pixel;
+      if (at.x() < 0 || at.y() < 0 || at.x() > camera.intrinsics.width - 1 || at.y() > camera.intrinsics.height - 1)
+        return false;
+      const Eigen::Vector3d direction = (camera.center() - p).normalized();
+      return !caster.cast(p + self_m * direction, direction);
+    });
+    if (by_any) seen.push_back(p);
+  }
+  return seen;
+}
+
+double mean_distance_m(std::span<const Eigen::Vector3d> points, const RayCaster& to) {
+  double sum = 0;
+  for (const Eigen::Vector3d& p : points) sum += to.distance_m(p);
+  return sum / static_cast<double>(points.size());
+}
+
+MaskAgreement compare_masks(const Image& coverage, const Image& true_coverage) {
+  size_t both = 0, either = 0;
+  double smaller = 0, larger = 0;
+  for (int y = 0; y < coverage.height; ++y)
+    for (int x = 0; x < coverage.width; ++x) {
+      const int made = coverage.at(x, y), wanted = true_coverage.at(x, y);
+      both += made >= 128 && wanted >= 128;
+      either += made >= 128 || wanted >= 128;
+      smaller += std::min(made, wanted);
+      larger += std::max(made, wanted);
+    }
+  return {static_cast<double>(both) / static_cast<double>(either), smaller / larger};
 }
 
 double silhouette_iou(const RayCaster& caster, const RigCamera& camera, const Image& true_coverage, int step) {

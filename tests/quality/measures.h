@@ -1,8 +1,11 @@
 #pragma once
 
 #include <array>
+#include <filesystem>
 #include <memory>
 #include <optional>
+#include <span>
+#include <vector>
 
 #include "pipeline/types/avatar.h"
 #include "pipeline/types/image.h"
@@ -16,7 +19,7 @@ struct Hit {
   Eigen::Vector3f corner_weights = Eigen::Vector3f::Zero();
 };
 
-/// Casts rays at a mesh (Embree).
+/// Casts rays at a mesh, and finds its point next to another (Embree).
 class RayCaster {
  public:
   explicit RayCaster(const Mesh& mesh);
@@ -27,10 +30,33 @@ class RayCaster {
   /// @param direction  world frame, any length
   std::optional<Hit> cast(const Eigen::Vector3d& origin, const Eigen::Vector3d& direction) const;
 
+  /// How far a point is from the nearest of the mesh's surface, metres.
+  double distance_m(const Eigen::Vector3d& p) const;
+
  private:
   struct Scene;
   std::unique_ptr<Scene> scene_;
 };
+
+/// A binary little-endian PLY file's vertices and triangles. Throws what the standard library throws at files that are
+/// none: truth files are part of a test.
+Mesh read_ply(const std::filesystem::path& file);
+
+/// Points evenly spread over a mesh's surface, the same for the same mesh.
+std::vector<Eigen::Vector3d> sample_surface(const Mesh& mesh, size_t count);
+
+/// Of points on the surface that the caster holds, those that at least one camera sees unoccluded.
+std::vector<Eigen::Vector3d> seen_points(std::span<const Eigen::Vector3d> points, const RayCaster& caster,
+                                         const Rig& rig);
+
+double mean_distance_m(std::span<const Eigen::Vector3d> points, const RayCaster& to);
+
+/// How well a mask covers the truth.
+struct MaskAgreement {
+  double iou = 0;       ///< of the pixels that are covered by one half or more
+  double soft_iou = 0;  ///< sum of the smaller over sum of the larger coverage of every pixel
+};
+MaskAgreement compare_masks(const Image& coverage, const Image& true_coverage);
 
 /// Intersection over union of the pixels whose centre's ray meets the mesh and those whose true coverage is at
 /// least one half. Every `step`-th row and column is looked at.
