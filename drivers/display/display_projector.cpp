@@ -230,7 +230,7 @@ class KmsProjector final : public FlippingProjector {
       return Error{ErrorCode::unsupported,
                    settings.id + ": " + output.card_path + " does not stamp its flips with the monotonic clock"};
     if (drmIsMaster(fd) == 0 && drmSetMaster(fd) != 0)
-      return Error{errno == EACCES || errno == EPERM ? ErrorCode::busy : ErrorCode::io,
+      return Error{errno == EBUSY || errno == EACCES || errno == EPERM ? ErrorCode::busy : ErrorCode::io,
                    settings.id + ": another program draws on " + output.card_path + " (" + std::strerror(errno) + ")"};
     auto projector = std::unique_ptr<KmsProjector>(new KmsProjector(settings, clock, std::move(output), *pattern));
     for (auto& buffer : projector->buffers_) {

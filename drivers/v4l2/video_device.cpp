@@ -191,7 +191,9 @@ VideoDevice::~VideoDevice() {
 }
 
 Result<void> VideoDevice::check_presence() const {
-  pollfd poll_fd{fd_, POLLIN, 0};
+  // Nothing is polled for but the hang-up, which always counts: who polls for input before a stream has begun may start
+  // the kernel's emulation of read(2), which then owns the buffers.
+  pollfd poll_fd{fd_, 0, 0};
   if (::poll(&poll_fd, 1, 0) > 0 && (poll_fd.revents & (POLLHUP | POLLNVAL)) != 0)
     return Error{ErrorCode::device_lost, name_ + ": was unplugged"};
   return {};

@@ -1,0 +1,35 @@
+#include "tests/virtual_booth/guest/guest_booth.h"
+
+#include <cstdlib>
+#include <stdexcept>
+
+namespace booth {
+
+GuestBooth::GuestBooth() {
+  for (const char* module : {"gpio-sim", "vhci-hcd", "uvcvideo", "vkms"})
+    if (std::system((std::string("modprobe ") + module).c_str()) != 0)
+      throw std::runtime_error(std::string("the kernel has no module ") + module);
+  gpio_ = std::make_unique<GpioPeer>(8, std::vector<std::string>{"camera-trigger", "lights", "step", "reset"},
+                                     [this](const GpioPeer::Edge& edge) {
+                                       if (edge.line != trigger_line || edge.level != 1) return;
+                                       const std::lock_guard lock(mutex_);
+                                       for (UsbCameraPeer* camera : cameras_) camera->expose();
+                                     });
+}
+
+void GuestBooth::wire(UsbCameraPeer& camera) {
+  const std::lock_guard lock(mutex_);
+  cameras_.insert(&camera);
+}
+
+void GuestBooth::unwire(UsbCameraPeer& camera) {
+  const std::lock_guard lock(mutex_);
+  cameras_.erase(&camera);
+}
+
+GuestBooth& GuestBooth::instance() {
+  static GuestBooth booth;
+  return booth;
+}
+
+}  // namespace booth
