@@ -6,6 +6,8 @@
 #include <cstdint>
 #include <limits>
 
+#include "pipeline/geometry/camera_model.h"
+
 namespace booth {
 namespace {
 
@@ -20,6 +22,8 @@ constexpr int fewest_deep_witnesses = 6;  // for a hole: with few cameras true c
 /// Around a point of the missing part as much as lies between the points and within the agreement's margin.
 constexpr double reach_m = 0.03;
 
+constexpr int looks_across = 60;  ///< pixels along an image's shorter side that are looked at for what is unexplained
+
 /// A point that one camera alone denies.
 struct Denied {
   std::array<int, 3> place;
@@ -27,6 +31,24 @@ struct Denied {
   bool deep;    ///< inside the hull of all others
   bool proven;  ///< that the camera is wrong
 };
+
+/// Whether a line through a point meets the hull, in steps of a sample; it passes the nearest sample by less than a
+/// voxel.
+bool meets(const Field& hull, const Eigen::Vector3d& p, const Eigen::Vector3d& direction) {
+  const Grid& grid = hull.grid();
+  for (const double way : {1.0, -1.0}) {
+    const Eigen::Vector3d step = way * direction;
+    Eigen::Vector3d at = (p - grid.origin) / grid.voxel_m;
+    while (true) {
+      const auto i = static_cast<int>(std::lround(at.x())), j = static_cast<int>(std::lround(at.y()));
+      const auto k = static_cast<int>(std::lround(at.z()));
+      if (i < 0 || j < 0 || k < 0 || i >= grid.size[0] || j >= grid.size[1] || k >= grid.size[2]) break;
+      if (static_cast<double>(hull.at(i, j, k)) < grid.voxel_m) return true;
+      at += step;
+    }
+  }
+  return false;
+}
 
 class Search {
  public:
@@ -86,24 +108,7 @@ class Search {
     for (uint32_t v = 0; v < views_.size(); ++v) {
       if (v == denier) continue;
       const float distance = views_[v]->distance_m(p.cast<float>());
-      if (distance < -agreed_m && !meets_hull(p, (p - views_[v]->camera().center()).normalized())) return true;
-    }
-    return false;
-  }
-
-  bool meets_hull(const Eigen::Vector3d& p, const Eigen::Vector3d& direction) const {
-    const Grid& grid = hull_.grid();
-    for (const double way : {1.0, -1.0}) {
-      const Eigen::Vector3d step = way * direction;  // one sample long
-      Eigen::Vector3d at = (p - grid.origin) / grid.voxel_m;
-      while (true) {
-        const auto i = static_cast<int>(std::lround(at.x())), j = static_cast<int>(std::lround(at.y()));
-        const auto k = static_cast<int>(std::lround(at.z()));
-        if (i < 0 || j < 0 || k < 0 || i >= grid.size[0] || j >= grid.size[1] || k >= grid.size[2]) break;
-        // The ray passes the nearest sample by less than a voxel.
-        if (static_cast<double>(hull_.at(i, j, k)) < grid.voxel_m) return true;
-        at += step;
-      }
+      if (distance < -agreed_m && !meets(hull_, p, (p - views_[v]->camera().center()).normalized())) return true;
     }
     return false;
   }
@@ -199,6 +204,31 @@ std::vector<Contradiction> find_contradictions(const Eigen::AlignedBox3d& volume
     if (!contradiction.discs.empty()) contradictions.push_back(std::move(contradiction));
   }
   return contradictions;
+}
+
+double unexplained_share(const SilhouetteView& view, const Field& hull) {
+  const Image& coverage = view.coverage();
+  const Eigen::Vector3d center = view.camera().center();
+  const Grid& grid = hull.grid();
+  const Eigen::Vector3d low = grid.origin, high = grid.point(grid.size[0] - 1, grid.size[1] - 1, grid.size[2] - 1);
+  const int spacing_px = std::max(1, std::min(coverage.width, coverage.height) / looks_across);
+  size_t looks = 0, unexplained = 0;
+  for (int y = spacing_px / 2; y < coverage.height; y += spacing_px)
+    for (int x = spacing_px / 2; x < coverage.width; x += spacing_px) {
+      if (coverage.at(x, y) < 128) continue;
+      ++looks;
+      const Eigen::Vector3d direction = world_ray(view.camera(), {x, y});
+      // From the middle of the ray's way through the grid both ways.
+      double begin_m = 0, end_m = std::numeric_limits<double>::infinity();
+      for (int axis = 0; axis < 3; ++axis) {
+        const double a = (low[axis] - center[axis]) / direction[axis],
+                     b = (high[axis] - center[axis]) / direction[axis];
+        begin_m = std::max(begin_m, std::min(a, b));
+        end_m = std::min(end_m, std::max(a, b));
+      }
+      unexplained += begin_m >= end_m || !meets(hull, center + 0.5 * (begin_m + end_m) * direction, direction);
+    }
+  return looks > 0 ? static_cast<double>(unexplained) / static_cast<double>(looks) : 0;
 }
 
 Image overrule(const Image& coverage, const Contradiction& contradiction) {

@@ -32,6 +32,10 @@ struct Contradiction {
 std::vector<Contradiction> find_contradictions(const Eigen::AlignedBox3d& volume, const SilhouetteViews& views,
                                                const Field& hull, const Work& work = {});
 
+/// The share of a view's subject that the hull does not cover: what the view alone shows, or what stands apart from
+/// the subject, such as furniture and other people.
+double unexplained_share(const SilhouetteView& view, const Field& hull);
+
 /// The coverage with the discs added to the subject.
 Image overrule(const Image& coverage, const Contradiction& contradiction);
 

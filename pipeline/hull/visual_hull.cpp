@@ -19,6 +19,9 @@ constexpr int side = Field::brick_side;
 /// Values are cut off at this many voxels: the zero level needs no more than the ends of the edges that cross it.
 constexpr double cut_off_voxels = 2;
 
+/// A mask may show so much that is not the subject before an operator is told. Measured where all is well: up to 0.008.
+constexpr double much_unexplained = 0.03;
+
 /// A cube of bricks, and the cameras whose say about it is still open.
 struct Node {
   std::array<int, 3> brick;  ///< its first brick
@@ -328,6 +331,15 @@ Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette>
   if (work.stopped()) return Work::cancelled();
   if (parts.kept_samples == 0)
     return Error{ErrorCode::no_subject, "no point of the capture volume is inside all silhouettes"};
+  std::vector<double> unexplained(views.size());
+  work.parallel_for(views.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t v = begin; v < end; ++v) unexplained[v] = unexplained_share(*views[v], hull.field);
+  });
+  for (size_t v = 0; v < views.size(); ++v)
+    if (unexplained[v] > much_unexplained)
+      hull.warnings.push_back("camera " + views[v]->camera().id + " shows " +
+                              std::to_string(std::lround(100 * unexplained[v])) +
+                              " % besides the subject that the other cameras do not confirm");
   hull.views = std::move(views);
   work.report(1);
   return hull;

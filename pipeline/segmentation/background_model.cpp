@@ -247,9 +247,9 @@ class Drift {
 
 /// Steps of lightness from cell to cell below this tell nothing about a movement.
 constexpr float telling_gradient = 0.02F;
-/// Cells that the movement explains to within this decide on it.
-constexpr float movement_slack = 0.06F;
-constexpr int movement_rounds = 4;
+/// Cells that the movement explains to within this decide on it, round by round: all that the subject does not stand
+/// before at first, as no movement is known yet.
+constexpr std::array<float, 6> movement_slack{0.4F, 0.3F, 0.2F, 0.1F, 0.06F, 0.06F};
 /// Fewer telling cells than this share of the image are too few, as are such whose edges all run one way.
 constexpr double fewest_telling = 0.002;
 constexpr double least_condition = 0.02;
@@ -279,12 +279,12 @@ std::array<float, 2> find_movement(const CellPlanes& lightness, const CellPlanes
   }
   std::array<float, 2> shift{0, 0};
   if (static_cast<double>(cells.size()) < fewest_telling * static_cast<double>(grid.count())) return shift;
-  for (int round = 0; round < movement_rounds; ++round) {
+  for (const float slack : movement_slack) {
     double xx = 0, xy = 0, yy = 0, xd = 0, yd = 0;
     for (const Telling& cell : cells) {
       const float left = cell.d + cell.gx * shift[0] + cell.gy * shift[1];
       // Geman and McClure's weight: who stands before the background has next to no say.
-      const float ratio = left / movement_slack;
+      const float ratio = left / slack;
       const double weight = 1 / ((1 + ratio * ratio) * (1 + ratio * ratio));
       xx += weight * cell.gx * cell.gx;
       xy += weight * cell.gx * cell.gy;

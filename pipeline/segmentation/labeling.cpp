@@ -358,6 +358,25 @@ void fill_false_holes(CellMask& mask, const CellGrid& grid, const std::vector<fl
   }
 }
 
+/// Share of the subject's outline inside which, to a cell's reach, nothing is clearly subject.
+double faint_share(const CellMask& mask, const CellGrid& grid, const std::vector<float>& evidence) {
+  size_t outline = 0, faint = 0;
+  for (int y = 1; y + 1 < grid.height; ++y) {
+    for (int x = 1; x + 1 < grid.width; ++x) {
+      const size_t i = grid.index(x, y);
+      const auto width = static_cast<size_t>(grid.width);
+      if (mask[i] == 0 || (mask[i - 1] & mask[i + 1] & mask[i - width] & mask[i + width]) != 0) continue;
+      float clearest = 0;
+      for (const size_t row : {i - width, i, i + width})
+        for (const size_t cell : {row - 1, row, row + 1})
+          if (mask[cell] != 0) clearest = std::max(clearest, evidence[cell]);
+      ++outline;
+      faint += clearest < clear_subject;
+    }
+  }
+  return outline > 0 ? static_cast<double>(faint) / static_cast<double>(outline) : 0;
+}
+
 }  // namespace
 
 Labeling label_cells(const CellGrid& grid, const Residual& residual, const CellPlanes& body,
@@ -376,6 +395,7 @@ Labeling label_cells(const CellGrid& grid, const Residual& residual, const CellP
   labeling.subject = cut(evidence, BoundaryCost(residual, body, options.smoothness), grid);
   labeling.second_part = remove_specks(labeling.subject, grid, options.smallest_part);
   fill_false_holes(labeling.subject, grid, evidence, plain_cost);
+  labeling.faint_outline = faint_share(labeling.subject, grid, evidence);
   std::vector<float> of_subject;
   for (size_t i = 0; i < evidence.size(); ++i) {
     if (labeling.subject[i] != 0) of_subject.push_back(evidence[i]);

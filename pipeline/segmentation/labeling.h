@@ -19,8 +19,9 @@ using CellMask = std::vector<uint8_t>;
 struct Labeling {
   CellMask subject;
   size_t subject_cells = 0;
-  double second_part = 0;  ///< the second largest connected part's share of the largest's area
-  double contrast = 0;     ///< median evidence of the subject's cells, 0 (looks like background) … 1
+  double second_part = 0;    ///< the second largest connected part's share of the largest's area
+  double faint_outline = 0;  ///< share of the outline along which the subject hardly differs from the background
+  double contrast = 0;       ///< median evidence of the subject's cells, 0 (looks like background) … 1
 };
 
 /// Which cells are subject: the minimum of an energy whose data term asks how unlike a shadowed, drifted, noisy

@@ -15,18 +15,20 @@ using segmentation::Labeling;
 using segmentation::Residual;
 
 // When an operator should have a look.
-constexpr double much_border = 0.5;        ///< share of the image's border that the subject touches
-constexpr double much_drift = 1.4;         ///< factor in linear light between the captures
-constexpr double little_agreement = 0.25;  ///< share of the image that still looks like the background
-constexpr double large_second_part = 0.2;  ///< see Labeling::second_part
-constexpr double little_contrast = 0.3;    ///< see Labeling::contrast
+constexpr double much_border = 0.5;         ///< share of the image's border that the subject touches
+constexpr double much_drift = 1.4;          ///< factor in linear light between the captures
+constexpr double little_agreement = 0.25;   ///< share of the image that still looks like the background
+constexpr double large_second_part = 0.03;  ///< see Labeling::second_part
+/// See Labeling::faint_outline. Measured: up to 0.05 in colour, from 0.09 in grey with skin as bright as the wall.
+constexpr double much_faint_outline = 0.08;
+constexpr double little_contrast = 0.3;  ///< see Labeling::contrast
 
 /// What is left of a camera's movement is undone to first order when smaller than this; the background is moved by
 /// whole pixels and looked at anew when larger.
 constexpr float small_movement_px = 0.6F;
 constexpr int most_realignments = 3;
 constexpr float largest_movement_px = 12;  ///< more is no camera that was touched but one that looks elsewhere
-constexpr float much_movement_px = 0.75F;  ///< the calibration suffers
+constexpr float much_movement_px = 0.6F;   ///< the calibration suffers
 
 bool is_misaligned(const BackgroundModel& model, const Residual& residual) {
   const float x = residual.movement_px[0], y = residual.movement_px[1];
@@ -125,7 +127,8 @@ std::vector<std::string> find_warnings(const Residual& residual, const Labeling&
     warn(text.str());
   }
   if (residual.drift_support < little_agreement) warn("little of the image still looks like the background");
-  if (labeling.contrast < little_contrast) warn("the subject hardly differs from the background");
+  if (labeling.faint_outline > much_faint_outline || labeling.contrast < little_contrast)
+    warn("the subject hardly differs from the background; parts of it may be missing");
   if (labeling.second_part > large_second_part) warn("something else than the subject seems to be in view");
   if (border_share(result.silhouette.coverage) > much_border)
     warn("the subject reaches over most of the image's border");

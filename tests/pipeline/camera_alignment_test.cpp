@@ -97,6 +97,17 @@ TEST(CameraAlignment, AMissingLimbIsNotTakenForAMovedCamera) {
               ElementsAre(testing::AllOf(HasSubstr(capture.silhouettes[2].camera), HasSubstr("lacks a part"))));
 }
 
+TEST(CameraAlignment, WhatOneCameraAloneShowsIsReported) {
+  Capture capture = exact_capture();
+  Image& coverage = capture.silhouettes[5].coverage;
+  for (int y = coverage.height / 3; y < coverage.height; ++y)
+    std::fill_n(coverage.pixel(0, y), coverage.width / 8, uint8_t{255});
+  const auto hull = carve_visual_hull(capture.rig, capture.silhouettes, coarse);
+  ASSERT_TRUE(hull.ok());
+  EXPECT_THAT(hull->warnings,
+              ElementsAre(testing::AllOf(HasSubstr(capture.silhouettes[5].camera), HasSubstr("do not confirm"))));
+}
+
 TEST(CameraAlignment, GivesTheSameForAnyOrderOfCamerasAndNumberOfThreads) {
   Capture capture = with_moved_camera(1, {-2.5, 1.5});
   const auto first = carve_visual_hull(capture.rig, capture.silhouettes, coarse);
