@@ -108,6 +108,8 @@ void visit_reconstruct(Visitor& visitor, ReconstructionOptions& options) {
   visitor.integer("atlas_size", options.atlas.size, 256, 8192);
   visitor.millimetres("voxel_mm", options.hull.voxel_m, 1, 50);
   visitor.integer("min_views", options.hull.min_views, 1, 256);
+  visitor.choice("skeleton", options.skeleton.method,
+                 Words<SkeletonMethod>{{"anatomy", SkeletonMethod::anatomy}, {"embedding", SkeletonMethod::embedding}});
 }
 
 template <class Visitor>

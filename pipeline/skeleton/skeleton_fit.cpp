@@ -12,6 +12,7 @@
 #include <utility>
 
 #include "pipeline/geometry/interior.h"
+#include "pipeline/skeleton/embedding.h"
 
 namespace booth {
 namespace {
@@ -47,8 +48,6 @@ constexpr double spine_of_trunk_depth = 0.37;   // the column of vertebrae, from
 constexpr double sacrum_of_trunk_depth = 0.16;  // where it stands on the pelvis
 constexpr double deepest_trunk_share = 0.18;    // what is deeper is a skirt's or a coat's
 
-enum Side { left = 0, right = 1 };
-double sign(size_t side) { return side == left ? 1 : -1; }
 const char* name(size_t side) { return side == left ? "left" : "right"; }
 
 Error not_riggable(const std::string& why) { return {ErrorCode::not_riggable, "skeleton: " + why}; }
@@ -74,18 +73,6 @@ struct Body {
 struct Ends {
   size_t head = 0;
   std::array<std::optional<size_t>, 2> hand, foot;  // left, right
-};
-
-struct TrunkJoints {
-  Vector3d pelvis;  // between the hip joints; not a joint itself
-  Vector3d hips, spine, spine1, spine2, neck, head, crown;
-};
-struct ArmJoints {
-  Vector3d clavicle = Vector3d::Zero(), shoulder = Vector3d::Zero(), elbow = Vector3d::Zero(), wrist = Vector3d::Zero(),
-           fingers = Vector3d::Zero();
-};
-struct LegJoints {
-  Vector3d hip, knee, ankle, ball, toes;
 };
 
 // ---- measuring -----------------------------------------------------------------------------------------------------
@@ -346,6 +333,26 @@ void cut_at_trunk(const Body& body, std::vector<Station>& line) {
   if (line.size() > 2) line.pop_back();  // the last slab is cut off by the end of the limb
 }
 
+/// The mean of places, each as likely as a normal distribution has it whose squared deviations are the costs. Unlike
+/// the cheapest place it does not jump where several are about as cheap.
+class LikelyPlace {
+ public:
+  void add(const Vector3d& p, double cost) {
+    places_.emplace_back(p, cost);
+    least_ = std::min(least_, cost);
+  }
+  std::optional<Vector3d> mean() const {
+    if (places_.empty()) return std::nullopt;
+    Centroid centroid;
+    for (const auto& [p, cost] : places_) centroid.add(p, std::exp(-0.5 * (cost - least_)));
+    return centroid.mean();
+  }
+
+ private:
+  std::vector<std::pair<Vector3d, double>> places_;
+  double least_ = std::numeric_limits<double>::infinity();
+};
+
 /// The shoulder's outline from the front: the highest inside of every column of x.
 std::vector<double> outline_from_above(const Body& body) {
   std::vector<double> top(static_cast<size_t>(body.interior.grid.size[0]), -std::numeric_limits<double>::infinity());
@@ -364,8 +371,7 @@ Vector3d shoulder_joint(const Body& body, const std::vector<double>& outline, do
   const double depth_z = 0.5 * (trunk.neck.z() + trunk.spine2.z());
   const double voxel = body.voxel();
   const int reach = static_cast<int>(std::ceil(cover / voxel));
-  double least = std::numeric_limits<double>::infinity();
-  Vector3d best(middle + sign(side) * shoulder_half_share * body.stature, body.height(0.8), depth_z);
+  LikelyPlace likely;
   for (int i = reach; i + reach < static_cast<int>(outline.size()); ++i) {
     const double x = body.interior.grid.point(i, 0, 0).x();
     const double aside = sign(side) * (x - middle) / body.stature;
@@ -381,11 +387,10 @@ Vector3d shoulder_joint(const Body& body, const std::vector<double>& outline, do
     const double drop = (trunk.neck.y() - p.y()) / body.stature;
     double cost = squared((aside - shoulder_half_share) / 0.012) + squared((drop - shoulder_drop_share) / 0.02);
     if (elbow) cost += squared(((p - *elbow).norm() / body.stature - upper_arm_share) / 0.015);
-    if (cost < least) {
-      least = cost;
-      best = p;
-    }
+    likely.add(p, cost);
   }
+  Vector3d best = likely.mean().value_or(
+      Vector3d(middle + sign(side) * shoulder_half_share * body.stature, body.height(0.8), depth_z));
   const double near = 0.02 * body.stature;
   best.z() = centre_near(body, best, {near, near, body.stature}).z() + shoulder_ahead_share * body.stature;
   return best;
@@ -440,8 +445,7 @@ Vector3d find_elbow(const Body& body, const std::vector<Station>& line, double w
   size_t first = 0;
   while (first + 1 < line.size() && line[first].along < wrist) ++first;
   const Vector3d from = line[first].p, to = line.back().p;
-  double least = std::numeric_limits<double>::infinity();
-  Vector3d best = point_along(line, expected * arm_length);
+  LikelyPlace likely;
   for (double share = 0.48; share < 0.75; share += 0.005) {
     if (share * arm_length <= line[first].along) continue;
     const Vector3d on_line = point_along(line, share * arm_length);
@@ -458,13 +462,10 @@ Vector3d find_elbow(const Body& body, const std::vector<Station>& line, double w
       misfit /= static_cast<double>(line.size() - first) * tolerance * tolerance;
       const double unusual = (share - expected) / 0.025;
       const double cost = misfit + unusual * unusual;
-      if (cost < least) {
-        least = cost;
-        best = elbow;
-      }
+      likely.add(elbow, cost);
     }
   }
-  return best;
+  return likely.mean().value_or(point_along(line, expected * arm_length));
 }
 
 /// The centre line continued straight to a point.
@@ -835,7 +836,8 @@ class SkeletonBuilder {
   std::vector<Eigen::Isometry3d> world_;
 };
 
-Skeleton build(const TrunkJoints& trunk, const std::array<ArmJoints, 2>& arms, const std::array<LegJoints, 2>& legs) {
+Skeleton build(const BodyJoints& body) {
+  const auto& [trunk, arms, legs] = body;
   const Vector3d forward = Vector3d::UnitZ(), up = Vector3d::UnitY();
   SkeletonBuilder tree;
   const int hips = tree.add("Hips", -1, trunk.hips, trunk.spine, forward);
@@ -937,12 +939,8 @@ std::array<ArmJoints, 2> place_arms(const Body& body, const std::array<std::vect
   return arms;
 }
 
-/// Where all joints are, and what could not be seen.
-struct PlacedJoints {
-  TrunkJoints trunk;
-  std::array<ArmJoints, 2> arms;
-  std::array<LegJoints, 2> legs;
-  std::vector<std::string> warnings;
+struct PlacedJoints : BodyJoints {
+  std::vector<std::string> warnings;  // what could not be seen
 };
 
 /// Moves a joint along its bone until that has the length, and what hangs from it too.
@@ -1122,10 +1120,17 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
                  "skeleton.cells: " + std::to_string(options.cells) + ", expected 100 … 400"};
   if (const auto checked = check(mesh); !checked) return checked.error();
 
+  if (options.method == SkeletonMethod::embedding) {
+    auto embedded = embed_skeleton(sample_interior(mesh, options.cells));
+    if (!embedded) return not_riggable(embedded.error().message);
+    work.report(1);
+    return FittedSkeleton{build(*embedded), {}};
+  }
+
   // First coarsely along the axes of the mass, which gives the person's own axes; then finely along these.
   Eigen::Matrix3d rotation = axes_of_mass(mesh);
   constexpr int coarse_cells = 100;
-  const auto coarse = find_subject(turned(mesh, rotation), {.cells = coarse_cells});
+  const auto coarse = find_subject(turned(mesh, rotation), {.cells = coarse_cells, .method = options.method});
   if (work.stopped()) return Work::cancelled();
   rotation = coarse ? (axes_of_joints(place_joints(*coarse), coarse->ends) * rotation).eval()
                     : Eigen::Matrix3d::Identity().eval();
@@ -1135,7 +1140,7 @@ Result<FittedSkeleton> fit_skeleton(const Mesh& mesh, const SkeletonOptions& opt
   if (work.stopped()) return Work::cancelled();
   PlacedJoints joints = place_joints(*subject);
 
-  FittedSkeleton result{build(joints.trunk, joints.arms, joints.legs), std::move(joints.warnings)};
+  FittedSkeleton result{build(joints), std::move(joints.warnings)};
   Joint& root = result.skeleton.joints.front();
   root.parent_from_joint = Eigen::Isometry3d(Eigen::Quaterniond(rotation.transpose())) * root.parent_from_joint;
   work.report(1);

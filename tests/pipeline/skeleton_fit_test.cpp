@@ -14,6 +14,7 @@
 #include "pipeline/geometry/interior.h"
 #include "pipeline/surface/marching_cubes.h"
 #include "tests/synthetic/body.h"
+#include "tests/synthetic/people.h"
 
 namespace booth {
 namespace {
@@ -75,24 +76,6 @@ void expect_person(const Person& person, double tolerance) {
   if (fit.joints.empty()) return;
   expect_joints_near(fit, person, tolerance);
   expect_inside(fit, mesh);
-}
-
-/// Large head, short legs: a child of about four.
-Person with_proportions_of_a_child(Person person, double stature) {
-  const double hips = 0.52 * stature, neck = 0.875 * stature, leg_scale = 0.82, head_scale = 1.45;
-  const auto lift = [&](Vector3d p) {
-    if (p.y() > neck) p = Vector3d(0, neck, 0) + head_scale * (p - Vector3d(0, neck, 0));
-    p.y() = p.y() < hips ? leg_scale * p.y() : p.y() - (1 - leg_scale) * hips;
-    return p;
-  };
-  for (auto& capsule : person.body) {
-    const double scale = capsule.from.y() > neck ? head_scale : 1;
-    const double sole = capsule.from.y() < 0.03 * stature ? (1 - leg_scale) * capsule.from.y() : 0;
-    capsule = {lift(capsule.from) + Vector3d(0, sole, 0), lift(capsule.to) + Vector3d(0, sole, 0),
-               scale * capsule.from_radius_m, scale * capsule.to_radius_m};
-  }
-  for (auto& [name, p] : person.joints) p = lift(p);
-  return person;
 }
 
 Vector3d mirrored(const Vector3d& p) { return {-p.x(), p.y(), p.z()}; }
@@ -195,7 +178,10 @@ TEST(SkeletonFit, FindsAStraddleAndClosedLegs) {
 }
 
 TEST(SkeletonFit, FindsChildren) {
-  expect_person(with_proportions_of_a_child(synthetic::person({.height_m = 1.1}), 1.1), 0.045);
+  for (const double height : {0.95, 1.1, 1.3}) {
+    SCOPED_TRACE(height);
+    expect_person(synthetic::child(height), 0.045);
+  }
 }
 
 TEST(SkeletonFit, APonytailIsNotAHand) {
@@ -276,21 +262,32 @@ TEST(SkeletonFit, StandsABodyThatIsTurned) {
 }
 
 TEST(SkeletonFit, HandsOnTheHipsLeaveTheElbowsToFollow) {
-  Person person = synthetic::person();
-  std::erase_if(person.body, [](const synthetic::Capsule& c) { return std::abs(c.from.x()) > 0.18; });
-  for (const double side : {1.0, -1.0}) {
-    const Vector3d shoulder(side * 0.189, 1.374, 0), elbow(side * 0.40, 1.17, -0.06), hand(side * 0.16, 0.97, 0.02);
-    person.body.push_back({shoulder, elbow, 0.05, 0.04});
-    person.body.push_back({elbow, hand, 0.04, 0.03});
-    for (auto& [name, p] : person.joints)
-      if (name == (side > 0 ? "LeftForeArm" : "RightForeArm")) p = elbow;
-  }
-  std::erase_if(person.joints, [](const auto& joint) { return joint.first.find("Hand") != std::string::npos; });
+  const Person person = synthetic::with_hands_on_hips();
   const Mesh mesh = surface_of(person.body);
   const Fitted fit = fitted(mesh);
-  expect_joints_near(fit, person, 0.045);
+  expect_joints_near(fit, person, 0.035);
   expect_inside(fit, mesh);
   EXPECT_THAT(fit.warnings, testing::Contains(testing::HasSubstr("left hand cannot be told")));
+}
+
+TEST(SkeletonFit, FindsHeavyPeople) { expect_person(synthetic::heavy_person(), 0.04); }
+
+TEST(SkeletonFit, LongHairMovesNeitherHeadNorShoulders) { expect_person(synthetic::with_long_hair(), 0.035); }
+
+TEST(SkeletonFit, AShoulderBagIsNeitherAnArmNorALeg) { expect_person(synthetic::with_shoulder_bag(), 0.045); }
+
+TEST(SkeletonFit, ALongSkirtLeavesTheFeet) {
+  const Person person = synthetic::in_long_skirt();
+  const Fitted fit = fitted(surface_of(person.body));
+  expect_joints_near(fit, person, 0.045);
+  EXPECT_THAT(fit.warnings, testing::Contains(testing::HasSubstr("skirt")));
+}
+
+TEST(SkeletonFit, ArmsBesideTheBodyAreFoundByTheOutline) {
+  for (const double angle : {0.05, 0.12, 0.2}) {
+    SCOPED_TRACE(angle);
+    expect_person(synthetic::person({.arm_angle_rad = angle}), 0.045);
+  }
 }
 
 TEST(SkeletonFit, IgnoresCrumbsBesideTheBody) {
@@ -299,6 +296,29 @@ TEST(SkeletonFit, IgnoresCrumbsBesideTheBody) {
   person.body.push_back({{0.6, 1.5, 0.2}, {0.6, 1.5, 0.2}, 0.03, 0.03});
   const Fitted with_crumb = fitted(surface_of(person.body));
   for (const auto& [name, p] : fit.joints) EXPECT_LT((with_crumb.joints.at(name) - p).norm(), 0.02) << name;
+}
+
+TEST(SkeletonFit, TheMethodOfReferenceFindsTheLimbsRoughly) {
+  for (const double arm_angle : {0.75, 1.5}) {
+    SCOPED_TRACE(arm_angle);
+    const Person person = synthetic::person({.arm_angle_rad = arm_angle});
+    const auto result = fit_skeleton(surface_of(person.body), {.method = SkeletonMethod::embedding});
+    ASSERT_TRUE(result) << result.error().message;
+    EXPECT_TRUE(check(result->skeleton));
+    const auto world = world_from_joints(result->skeleton);
+    for (const auto& [name, known] : person.joints) {
+      if (name == "Hips" || name == "Neck" || name == "Head") continue;
+      const Vector3d found = world[static_cast<size_t>(result->skeleton.find(name))].translation();
+      EXPECT_LT((found - known).norm() / stature_m, 0.08) << name << " is off by " << (found - known).transpose();
+    }
+  }
+}
+
+TEST(SkeletonFit, TheMethodOfReferenceSaysWhatItCannotEmbed) {
+  const auto result = fit_skeleton(surface_of(synthetic::sphere(0.5)), {.method = SkeletonMethod::embedding});
+  ASSERT_FALSE(result);
+  EXPECT_EQ(result.error().code, ErrorCode::not_riggable);
+  EXPECT_THAT(result.error().message, testing::HasSubstr("skeleton: "));
 }
 
 TEST(SkeletonFit, RefusesWhatIsNoPerson) {
