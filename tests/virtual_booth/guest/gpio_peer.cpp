@@ -2,10 +2,12 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <chrono>
 #include <cstdio>
 #include <filesystem>
 #include <fstream>
+#include <iterator>
 #include <stdexcept>
 #include <utility>
 
@@ -98,11 +100,20 @@ void GpioPeer::watch() {
   }
 }
 
-std::vector<GpioPeer::Edge> GpioPeer::wait_edges(size_t count) {
+std::vector<GpioPeer::Edge> GpioPeer::wait_edges(const std::vector<int>& lines, size_t count) {
+  std::vector<Edge> found;
   std::unique_lock lock(mutex_);
-  EXPECT_TRUE(changed_.wait_for(lock, std::chrono::seconds(60), [&] { return edges_.size() >= count; }))
-      << edges_.size() << " of " << count << " edges came";
-  return edges_;
+  EXPECT_TRUE(changed_.wait_for(lock, std::chrono::seconds(60),
+                                [&] {
+                                  found.clear();
+                                  std::copy_if(edges_.begin(), edges_.end(), std::back_inserter(found),
+                                               [&](const Edge& edge) {
+                                                 return std::find(lines.begin(), lines.end(), edge.line) != lines.end();
+                                               });
+                                  return found.size() >= count;
+                                }))
+      << found.size() << " of " << count << " edges came";
+  return found;
 }
 
 void GpioPeer::forget_edges() {

@@ -481,7 +481,8 @@ TEST_F(GpioLines, ATriggerPulsesItsLineBetweenLights) {
   const auto fired = (*trigger)->fire();
   ASSERT_TRUE(fired);
   // Requesting a line sets it, to rest; then each goes on and off.
-  const std::vector<GpioPeer::Edge> edges = booth.gpio().wait_edges(2 + 4);
+  const std::vector<GpioPeer::Edge> edges =
+      booth.gpio().wait_edges({GuestBooth::trigger_line, GuestBooth::lights_line}, 2 + 4);
   std::vector<std::pair<int, int>> order;
   for (const GpioPeer::Edge& edge : edges) order.emplace_back(edge.line, edge.level);
   const std::pair<int, int> expected[] = {{1, 1}, {0, 1}, {0, 0}, {1, 0}};
@@ -505,7 +506,7 @@ TEST_F(GpioLines, AnActiveLowLineRestsHigh) {
     ASSERT_TRUE((*trigger)->fire());
     EXPECT_EQ(booth.gpio().level(4), 1);
   }
-  const auto edges = booth.gpio().wait_edges(2);
+  const auto edges = booth.gpio().wait_edges({4}, 3);
   EXPECT_TRUE(
       std::any_of(edges.begin(), edges.end(), [](const auto& edge) { return edge.line == 4 && edge.level == 0; }));
 }
@@ -539,7 +540,8 @@ TEST_F(GpioLines, AProjectorIsSteppedAndReset) {
     ASSERT_TRUE(projector) << projector.error().message;
     for (int i = 0; i < 8; ++i) ASSERT_TRUE((*projector)->show(i));
   }
-  const auto edges = booth.gpio().wait_edges(20);
+  // Both are requested; then a reset, eight steps and a reset, each on and off.
+  const auto edges = booth.gpio().wait_edges({GuestBooth::step_line, GuestBooth::reset_line}, 2 + 2 * (1 + 8 + 1));
   const auto rises = [&](int number) {
     return std::count_if(edges.begin(), edges.end(),
                          [&](const auto& edge) { return edge.line == number && edge.level == 1; });
