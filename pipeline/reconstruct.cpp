@@ -6,6 +6,7 @@
 #include <span>
 #include <utility>
 
+#include "pipeline/image/develop.h"
 #include "pipeline/surface/marching_cubes.h"
 
 namespace booth {
@@ -51,6 +52,33 @@ std::vector<Frame> background_of(const std::string& camera, std::span<const Fram
     for (const Frame& frame : set.frames)
       if (frame.camera == camera) frames.push_back(frame);
   return frames;
+}
+
+bool is_raw(const FrameSet& set) {
+  return std::any_of(set.frames.begin(), set.frames.end(), [](const Frame& frame) { return frame.mosaic.has_value(); });
+}
+
+/// The capture with its raw frames developed. @error invalid_argument  as develop
+Result<CaptureFrames> develop_all(const CaptureFrames& capture, const Work& work) {
+  CaptureFrames developed = capture;
+  std::vector<Frame*> frames;
+  for (FrameSet& set : developed.background)
+    for (Frame& frame : set.frames) frames.push_back(&frame);
+  for (Frame& frame : developed.body.frames) frames.push_back(&frame);
+  std::vector<std::optional<Error>> faults(frames.size());
+  work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end && !work.stopped(); ++i) {
+      auto frame = develop(*frames[i]);
+      if (frame)
+        *frames[i] = *std::move(frame);
+      else
+        faults[i] = frame.error();
+    }
+  });
+  if (work.stopped()) return Work::cancelled();
+  for (const auto& fault : faults)
+    if (fault) return *fault;
+  return developed;
 }
 
 /// Segments every camera that can be; a camera that cannot is left out and said in the warnings. When nothing is
@@ -141,6 +169,10 @@ const std::vector<std::string>& reconstruction_stages() {
 
 Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options, const Work& work,
                                    const StageProgress& progress) {
+  if (is_raw(capture.body) || std::any_of(capture.background.begin(), capture.background.end(), is_raw)) {
+    const auto developed = develop_all(capture, work);
+    return developed ? reconstruct(*developed, options, work, progress) : developed.error();
+  }
   if (const auto checked = check(capture.rig); !checked) return checked.error();
   Reconstruction result;
   std::vector<std::string>& warnings = result.warnings;

@@ -38,7 +38,7 @@ struct ReconstructionOptions {
   SkinningOptions skinning;
 };
 
-/// A capture, decoded.
+/// A capture, decoded. Raw frames (Frame::mosaic) are developed first.
 struct CaptureFrames {
   Rig rig;
   std::vector<FrameSet> background;  ///< the empty booth, one set a repetition

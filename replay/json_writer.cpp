@@ -50,10 +50,14 @@ Json projector_json(const CalibratedView& projector) {
 }
 
 Json frame_json(const FrameRecord& frame) {
-  return {{"camera", frame.camera},     {"index", frame.index},
-          {"file", frame.file},         {"timestamp_ns", frame.timestamp_ns},
-          {"frame_id", frame.frame_id}, {"exposure_us", frame.exposure_us},
-          {"gain_db", frame.gain_db}};
+  Json json = {{"camera", frame.camera},     {"index", frame.index},
+               {"file", frame.file},         {"timestamp_ns", frame.timestamp_ns},
+               {"frame_id", frame.frame_id}, {"exposure_us", frame.exposure_us},
+               {"gain_db", frame.gain_db}};
+  if (frame.mosaic)
+    json["mosaic"] = {{"pattern", bayer_patterns.at(static_cast<size_t>(frame.mosaic->pattern)).second},
+                      {"linear", frame.mosaic->linear}};
+  return json;
 }
 
 Json pattern_json(const GrayCodePattern& pattern) {

@@ -187,6 +187,20 @@ CalibrationBoard read_board(const JsonField& field) {
   return board;
 }
 
+Mosaic read_mosaic(const JsonField& field) {
+  Mosaic mosaic;
+  const JsonField pattern = field.member("pattern");
+  const std::string name = pattern.text(longest_text);
+  const auto found = std::find_if(bayer_patterns.begin(), bayer_patterns.end(),
+                                  [&](const auto& known) { return known.second == name; });
+  if (found == bayer_patterns.end())
+    pattern.refuse_value("\"rggb\", \"grbg\", \"gbrg\" or \"bggr\"");
+  else
+    mosaic.pattern = found->first;
+  if (const auto linear = field.find("linear")) mosaic.linear = linear->boolean();
+  return mosaic;
+}
+
 FrameRecord read_frame(const JsonField& field, int last_index) {
   constexpr double longest_exposure_us = 1e9;
   constexpr double largest_gain_db = 1000;
@@ -198,6 +212,7 @@ FrameRecord read_frame(const JsonField& field, int last_index) {
   if (const auto id = field.find("frame_id")) frame.frame_id = id->unsigned_integer();
   if (const auto exposure = field.find("exposure_us")) frame.exposure_us = exposure->number(0, longest_exposure_us);
   if (const auto gain = field.find("gain_db")) frame.gain_db = gain->number(-largest_gain_db, largest_gain_db);
+  if (const auto mosaic = field.find("mosaic")) frame.mosaic = read_mosaic(*mosaic);
   return frame;
 }
 
@@ -365,6 +380,8 @@ Result<Frame> load_frame(const Recording& recording, const FrameRecord& record) 
   if (!bytes) return bytes.error();
   auto image = decode_frame(*bytes, camera->intrinsics);
   if (!image) return Error{image.error().code, record.file + ": " + image.error().message};
+  if (record.mosaic && image->channels != 1)
+    return Error{ErrorCode::invalid_file, record.file + ": is said to be a mosaic, but is not grey"};
   return Frame{.camera = record.camera,
                .index = record.index,
                .timestamp_ns = record.timestamp_ns,
@@ -372,7 +389,8 @@ Result<Frame> load_frame(const Recording& recording, const FrameRecord& record) 
                .exposure_us = record.exposure_us,
                .gain_db = record.gain_db,
                .pixels = std::make_shared<const Image>(*std::move(image)),
-               .encoded = std::make_shared<const std::vector<uint8_t>>(*std::move(bytes))};
+               .encoded = std::make_shared<const std::vector<uint8_t>>(*std::move(bytes)),
+               .mosaic = record.mosaic};
 }
 
 LoadedShot load_shot(const Recording& recording, const Shot& shot, const Work& work) {

@@ -21,6 +21,7 @@ struct FrameRecord {
   uint64_t frame_id = 0;
   double exposure_us = 0;
   double gain_db = 0;
+  std::optional<Mosaic> mosaic = {};  ///< of a raw frame
 };
 
 struct CalibrationBoard {

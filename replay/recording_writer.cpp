@@ -23,11 +23,6 @@ Error invalid(const std::string& what) { return {ErrorCode::invalid_argument, wh
 
 constexpr size_t largest_image_bytes = size_t{512} << 20;
 
-std::vector<uint8_t> encode(const Image& image, const SpoolOptions& options) {
-  if (options.format == SpoolOptions::Format::jpeg) return encode_jpeg(image, options.jpeg_quality);
-  return encode_png(image, options.png_level);
-}
-
 /// frames/SHOT/CAMERA.png, or with the index where the shot holds a sequence.
 std::string image_file(const ShotHeader& shot, const std::string& camera, int index, ImageFormat format) {
   std::string file = "frames/" + shot.name + "/" + camera;
@@ -133,11 +128,14 @@ Result<void> RecordingWriter::add(const std::string& shot, const Frame& frame) {
     return invalid(name + " has " + std::to_string(frame.pixels->width) + " × " + std::to_string(frame.pixels->height) +
                    " pixels, the rig says " + std::to_string(camera->intrinsics.width) + " × " +
                    std::to_string(camera->intrinsics.height));
+  if (frame.mosaic && frame.pixels->channels != 1) return invalid(name + " is a mosaic of more than one channel");
   const auto header = content_->reserve(shot, frame.camera, frame.index);
   if (!header) return header.error();
 
   std::vector<uint8_t> encoded;
-  ImageFormat format = content_->options.format == SpoolOptions::Format::jpeg ? ImageFormat::jpeg : ImageFormat::png;
+  // JPEG would smear the colours of a mosaic into one another.
+  const bool lossy = content_->options.format == SpoolOptions::Format::jpeg && !frame.mosaic;
+  ImageFormat format = lossy ? ImageFormat::jpeg : ImageFormat::png;
   std::span<const uint8_t> bytes;
   if (frame.encoded && content_->options.keep_encoded) {
     const auto image = read_image_header(*frame.encoded);
@@ -145,7 +143,8 @@ Result<void> RecordingWriter::add(const std::string& shot, const Frame& frame) {
     format = image->format;
     bytes = *frame.encoded;
   } else {
-    encoded = encode(*frame.pixels, content_->options);
+    encoded = lossy ? encode_jpeg(*frame.pixels, content_->options.jpeg_quality)
+                    : encode_png(*frame.pixels, content_->options.png_level);
     bytes = encoded;
   }
   FrameRecord record{.camera = frame.camera,
@@ -154,7 +153,8 @@ Result<void> RecordingWriter::add(const std::string& shot, const Frame& frame) {
                      .timestamp_ns = frame.timestamp_ns,
                      .frame_id = frame.frame_id,
                      .exposure_us = frame.exposure_us,
-                     .gain_db = frame.gain_db};
+                     .gain_db = frame.gain_db,
+                     .mosaic = frame.mosaic};
   if (const auto written = content_->folder.write(record.file, bytes); !written) return written;
   content_->record(shot, std::move(record));
   return {};

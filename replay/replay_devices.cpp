@@ -358,7 +358,8 @@ class ReplayStage {
                      .frame_id = frame_id,
                      .exposure_us = record.exposure_us,
                      .gain_db = record.gain_db,
-                     .pixels = nullptr};
+                     .pixels = nullptr,
+                     .mosaic = record.mosaic};
     arrival.due = now + delay;
     if (options_.pace == ReplayOptions::Pace::real)
       arrival.due += offset + static_cast<Timestamp>(record.exposure_us * 1000) + transfer_ns;

@@ -204,6 +204,8 @@ TEST_F(ChangedRecording, SaysWhichFieldIsWrong) {
       {"recording.json", "\"camera\": \"body-01\"", "\"camera\": \"body-00\"",
        "recording.json: shots[0].frames[1]: is the second frame of body-00 with index 0"},
       {"recording.json", "\"index\": 0", "\"index\": -1", "recording.json: shots[0].frames[0].index: -1, expected"},
+      {"recording.json", "\"index\": 0", "\"index\": 0, \"mosaic\": {\"pattern\": \"rgb\"}",
+       "recording.json: shots[0].frames[0].mosaic.pattern: \"rgb\", expected \"rggb\", \"grbg\""},
       {"recording.json", "\"index\": 0", "\"index\": 0.5", "recording.json: shots[0].frames[0].index: 0.5, expected"},
       {"recording.json", "7679821475", "1e300", "recording.json: shots[0].frames[0].timestamp_ns: 1e+300, expected"},
       {"recording.json", "\"name\": \"body\"", "\"name\": \"background\"", "recording.json: shots[1].name: "},

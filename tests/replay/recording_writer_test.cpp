@@ -7,6 +7,7 @@
 #include <thread>
 
 #include "pipeline/image/codec.h"
+#include "pipeline/image/develop.h"
 #include "replay/durable_folder.h"
 #include "tests/replay/scratch_folder.h"
 
@@ -146,6 +147,35 @@ TEST(RecordingWriter, KeepsTheBytesOfTheCamera) {
     const auto stored = read_file(recording->folder / record.file, 1 << 20);
     EXPECT_EQ(*stored == *frame.encoded, keep);
     EXPECT_EQ(decode_image(*stored)->samples, frame.pixels->samples);
+  }
+}
+
+TEST(RecordingWriter, RawFramesComeBackRawAndDevelopTheSame) {
+  for (const auto format : {SpoolOptions::Format::png, SpoolOptions::Format::jpeg}) {
+    const ScratchFolder scratch;
+    auto writer = RecordingWriter::begin(scratch.path(), header, small_rig(), {.format = format});
+    ASSERT_TRUE(writer) << writer.error().message;
+    ASSERT_TRUE((*writer)->begin_shot({.name = "body", .role = ShotRole::body}));
+    Frame left = noise_frame("left", 0, 1), right = noise_frame("right", 0, 1);
+    left.mosaic = Mosaic{BayerPattern::gbrg, false};
+    right.mosaic = Mosaic{BayerPattern::bggr, true};
+    for (const Frame& frame : {left, right}) ASSERT_TRUE((*writer)->add("body", frame));
+    Frame colour = noise_frame("left", 1, 3);
+    colour.mosaic = Mosaic{};
+    EXPECT_EQ((*writer)->add("body", colour).error().code, ErrorCode::invalid_argument);
+    ASSERT_TRUE((*writer)->commit());
+
+    const auto recording = read_recording(scratch.path() / header.id);
+    ASSERT_TRUE(recording) << recording.error().message;
+    const LoadedShot loaded = load_shot(*recording, recording->shots[0]);
+    ASSERT_EQ(loaded.sets.size(), 1u);
+    ASSERT_EQ(loaded.sets[0].frames.size(), 2u);
+    for (const Frame& frame : loaded.sets[0].frames) {
+      const Frame& given = frame.camera == "left" ? left : right;
+      EXPECT_EQ(frame.mosaic, given.mosaic);
+      EXPECT_EQ(frame.pixels->samples, given.pixels->samples);
+      EXPECT_EQ(develop(frame)->pixels->samples, develop(given)->pixels->samples);
+    }
   }
 }
 
