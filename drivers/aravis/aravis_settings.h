@@ -16,7 +16,8 @@ enum class AravisTriggerSource { line, software, action };
 /// Which edge or level of the line (SFNC TriggerActivation).
 enum class AravisActivation { rising_edge, falling_edge, any_edge, level_high, level_low };
 
-/// How a sample follows light: proportionally, or as sRGB displays want it (the camera's gamma is set to 1/2.2).
+/// How samples follow light: proportionally (the camera's gamma is set to 1), or as displays want it (1/2.2). RGB8 is
+/// always sRGB.
 enum class AravisResponse { linear, srgb };
 
 /// A part of the sensor. Offsets count from the sensor's top left.
@@ -29,27 +30,27 @@ struct AravisRegion {
 
 /// A feature of the camera's own list (GenICam), set as given and read back: {"LineDebouncerTime", "50"}.
 struct AravisFeature {
-  std::string name;   ///< letters, digits and '_', 1 … 64 of them
-  std::string value;  ///< a number, an entry's name, text, "true" or "false"; a command takes "execute"
+  std::string name = {};   ///< letters, digits and '_', 1 … 64 of them
+  std::string value = {};  ///< a number, an entry's name, text, "true" or "false"; a command takes "execute"
 };
 
 /// A GigE Vision or USB3 Vision camera. A value that the camera cannot take is refused when it is opened, with the
 /// camera's own range.
 struct AravisCameraSettings {
-  std::string id;                      ///< as in the rig
+  std::string id = {};                 ///< as in the rig
   CameraRole role = CameraRole::body;  ///< as in the rig
-  std::string serial;                  ///< the device's serial number; either this or `address`
-  std::string address;                 ///< IPv4 address or host name; opening by it needs no discovery broadcast
+  std::string serial = {};             ///< the device's serial number; either this or `address`
+  std::string address = {};            ///< IPv4 address or host name; opening by it needs no discovery broadcast
 
-  double exposure_us = 10000;                 ///< 1 … 10 000 000
-  double gain_db = 0;                         ///< 0 … 60
-  std::optional<double> pattern_exposure_us;  ///< of gray_code shots, 1 … 10 000 000; nothing: exposure_us
-  std::optional<double> pattern_gain_db;      ///< of gray_code shots, 0 … 60; nothing: gain_db
-  std::optional<double> white_balance_red;    ///< ratio to green, 0.1 … 16; nothing: as the camera has it
-  std::optional<double> white_balance_blue;   ///< ratio to green, 0.1 … 16; nothing: as the camera has it
+  double exposure_us = 10000;                      ///< 1 … 10 000 000
+  double gain_db = 0;                              ///< 0 … 60
+  std::optional<double> pattern_exposure_us = {};  ///< of gray_code shots, 1 … 10 000 000; nothing: exposure_us
+  std::optional<double> pattern_gain_db = {};      ///< of gray_code shots, 0 … 60; nothing: gain_db
+  std::optional<double> white_balance_red = {};    ///< ratio to green, 0.1 … 16; nothing: as the camera has it
+  std::optional<double> white_balance_blue = {};   ///< ratio to green, 0.1 … 16; nothing: as the camera has it
   AravisResponse response = AravisResponse::linear;
   std::string pixel_format = "BayerRG8";  ///< Mono8, BayerRG8, BayerGR8, BayerGB8, BayerBG8 or RGB8
-  AravisRegion region;
+  AravisRegion region = {};
 
   AravisTriggerSource trigger = AravisTriggerSource::line;
   std::string trigger_line = "Line1";           ///< TriggerSource of a camera that is triggered by a line
@@ -68,9 +69,9 @@ struct AravisCameraSettings {
   int socket_buffer_kib = 16384;  ///< of the receiving socket, 64 … 1048576; the kernel's net.core.rmem_max bounds it
   bool packet_socket = false;     ///< receive through a packet socket, which needs CAP_NET_RAW
   int buffers = 0;                ///< frames that may be on their way or in use, 2 … 256; 0: as a shot needs
-  int heartbeat_ms = 3000;        ///< after which the camera frees itself of a dead booth, 500 … 60 000
+  int heartbeat_ms = 3000;        ///< after which the camera frees itself of a dead booth, 2000 … 60 000
   bool ptp = false;               ///< let the camera's clock follow the network's (IEEE 1588), and watch that it does
-  std::vector<AravisFeature> features;  ///< set after everything above, in this order; at most 64
+  std::vector<AravisFeature> features = {};  ///< set after everything above, in this order; at most 64
 };
 
 /// The GigE Vision action command that exposes all cameras whose trigger is AravisTriggerSource::action.
@@ -87,8 +88,8 @@ struct AravisActionSettings {
 };
 
 struct AravisSettings {
-  std::vector<AravisCameraSettings> cameras;
-  AravisActionSettings action;
+  std::vector<AravisCameraSettings> cameras = {};
+  AravisActionSettings action = {};
 };
 
 /// Every range above holds; ids are unique and safe, no two cameras share a serial or an address.
