@@ -40,6 +40,7 @@ class Booth:
             f'[api]\ncontrol = "{self.control}"\nevents = "{self.events}"\n'
             f'[disk]\nreserve_mib = 0\n'
             f'[replay]\nrecording = "{recording}"\npace = "fast"\n'
+            f'[export]\nanimation = true\nturntable = true\nformats = ["stl", "obj", "ply"]\n'
         )
         self.context = zmq.Context.instance()
         self.process = self.subscriber = None

@@ -119,7 +119,7 @@ TEST_P(AvatarQuality, ReachesTheFloors) {
   RecordProperty("silhouette_iou", std::to_string(iou));
 
   const double limbs_m = mean_limb_error_m(avatar.skeleton, json_of(folder / "truth/joints.json"));
-  EXPECT_LE(limbs_m, 0.060);
+  EXPECT_LE(limbs_m, 0.020);
   RecordProperty("limbs_mean_m", std::to_string(limbs_m));
 
   if (!fs::exists(folder / "truth/views/views.json")) return;
