@@ -40,6 +40,21 @@ std::string damage_of(const FilledBuffer& buffer, const VideoMode& mode, std::sp
   return {};
 }
 
+/// What a raw format's samples are; nothing of formats that are pictures already.
+std::optional<Mosaic> mosaic_of(V4l2Format format) {
+  switch (format) {
+    case V4l2Format::bayer_rggb: return Mosaic{BayerPattern::rggb};
+    case V4l2Format::bayer_grbg: return Mosaic{BayerPattern::grbg};
+    case V4l2Format::bayer_gbrg: return Mosaic{BayerPattern::gbrg};
+    case V4l2Format::bayer_bggr: return Mosaic{BayerPattern::bggr};
+    case V4l2Format::automatic:
+    case V4l2Format::mjpg:
+    case V4l2Format::yuyv:
+    case V4l2Format::grey: break;
+  }
+  return std::nullopt;
+}
+
 Image single_channel(std::span<const uint8_t> bytes, const VideoMode& mode) {
   Image image(mode.width, mode.height, 1);
   for (int y = 0; y < mode.height; ++y)
@@ -338,6 +353,7 @@ Result<Frame> V4l2Camera::develop(StreamedFrame streamed, int index) const {
     case V4l2Format::bayer_gbrg:
     case V4l2Format::bayer_bggr:
       frame.pixels = std::make_shared<const Image>(single_channel(streamed.bytes, mode));
+      frame.mosaic = mosaic_of(mode.format);
       break;
   }
   return frame;

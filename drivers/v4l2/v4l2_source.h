@@ -19,8 +19,8 @@ class V4l2Registry;
 /// on CLOCK_MONOTONIC.
 ///
 /// MJPG frames keep the camera's bytes as Frame::encoded, and a truncated one is never delivered; YUYV becomes RGB;
-/// GREY and Bayer samples stay as they are. A camera whose stream breaks off or that is unplugged is lost, and can be
-/// opened again when it is back: all settings are applied and verified again.
+/// GREY stays as it is; Bayer samples too, with Frame::mosaic. A camera whose stream breaks off or that is unplugged is
+/// lost, and can be opened again when it is back: all settings are applied and verified again.
 class V4l2Source final : public DeviceSource {
  public:
   /// @param clock   CLOCK_MONOTONIC, or in tests the simulated system's; outlives the source and its devices

@@ -157,6 +157,19 @@ TEST_F(V4l2, GreyAndColourComeOutAsTheyAre) {
     ASSERT_TRUE(frame) << frame.error().message;
     EXPECT_EQ(frame->pixels->samples, samples);
     EXPECT_FALSE(frame->encoded);
+    EXPECT_FALSE(frame->mosaic);
+  }
+  auto raw = settings();
+  raw.format = V4l2Format::bayer_rggb;
+  {
+    const auto camera = armed(raw);
+    camera->note_trigger(0, just_before());
+    ASSERT_TRUE(system->send(node, samples, clock.now()));
+    const auto frame = camera->wait_frame(soon());
+    ASSERT_TRUE(frame) << frame.error().message;
+    EXPECT_EQ(frame->pixels->samples, samples);
+    ASSERT_TRUE(frame->mosaic);
+    EXPECT_EQ(frame->mosaic->pattern, BayerPattern::rggb);
   }
   auto yuyv = settings();
   yuyv.format = V4l2Format::yuyv;
