@@ -17,6 +17,7 @@ using SteadyClock = std::chrono::steady_clock;
 double share_of(std::string_view stage) {
   if (stage == "segmentation") return 0.25;
   if (stage == "hull") return 0.15;
+  if (stage == "refine") return 0.1;
   if (stage == "surface") return 0.15;
   if (stage == "atlas") return 0.20;
   if (stage == "export") return 0.15;

@@ -163,7 +163,8 @@ std::optional<FaceMode> face_mode_from(std::string_view name) {
 }
 
 const std::vector<std::string>& reconstruction_stages() {
-  static const std::vector<std::string> stages{"segmentation", "hull", "surface", "atlas", "skeleton", "skin"};
+  static const std::vector<std::string> stages{"segmentation", "hull",     "refine", "surface",
+                                               "atlas",        "skeleton", "skin"};
   return stages;
 }
 
@@ -197,6 +198,14 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
     hull = std::move(*carved);
     result.cameras = std::move(hull.cameras);
     warnings.insert(warnings.end(), hull.warnings.begin(), hull.warnings.end());
+  }
+
+  {
+    const StageReport report("refine", work, progress);
+    hull.field = refine_shape(std::move(hull.field), hull.views, options.refinement, report.work());
+    remove_small_handles(hull.field, options.handles, report.work());
+    hull.views.clear();
+    if (work.stopped()) return Work::cancelled();
   }
 
   Avatar& avatar = result.avatar;

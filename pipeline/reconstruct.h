@@ -8,6 +8,8 @@
 
 #include "pipeline/atlas/texture_atlas.h"
 #include "pipeline/hull/visual_hull.h"
+#include "pipeline/refine/handle_removal.h"
+#include "pipeline/refine/shape_refinement.h"
 #include "pipeline/segmentation/segmentation.h"
 #include "pipeline/skeleton/skeleton_fit.h"
 #include "pipeline/skin/skinning.h"
@@ -31,6 +33,8 @@ struct ReconstructionOptions {
   FaceMode face = FaceMode::automatic;
   SegmentationOptions segmentation;
   VisualHullOptions hull;
+  ShapeRefinementOptions refinement;
+  HandleRemovalOptions handles;
   SmoothingOptions smoothing;
   DecimationOptions decimation;
   AtlasOptions atlas;
@@ -57,7 +61,7 @@ const std::vector<std::string>& reconstruction_stages();
 /// Called when a stage begins (fraction 0), while it runs, and when it ends (1).
 using StageProgress = std::function<void(std::string_view stage, double fraction)>;
 
-/// The whole method: segment → hull → surface → atlas → skeleton → skin.
+/// The whole method: segment → hull → refine → surface → atlas → skeleton → skin.
 ///
 /// @param work  its progress is not used; stages report through `progress`
 /// A camera that cannot be used is left out with a warning; a shape that cannot be rigged comes back without joints

@@ -10,7 +10,7 @@
 #include "pipeline/geometry/silhouette_view.h"
 #include "pipeline/hull/camera_alignment.h"
 #include "pipeline/hull/contradictions.h"
-#include "pipeline/hull/solid_parts.h"
+#include "pipeline/geometry/solid_parts.h"
 
 namespace booth {
 namespace {

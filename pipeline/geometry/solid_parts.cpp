@@ -1,4 +1,4 @@
-#include "pipeline/hull/solid_parts.h"
+#include "pipeline/geometry/solid_parts.h"
 
 #include <algorithm>
 #include <array>

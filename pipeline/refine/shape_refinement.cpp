@@ -1,0 +1,124 @@
+#include "pipeline/refine/shape_refinement.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <utility>
+#include <vector>
+
+#include "pipeline/geometry/solid_parts.h"
+#include "pipeline/refine/hull_samples.h"
+#include "pipeline/refine/smooth_distance.h"
+
+namespace booth {
+namespace {
+
+constexpr int side = Field::brick_side;
+constexpr double cell_m = 0.02;  // of the grid on which the surface is looked for
+/// Around sure hull the smooth surface may be this far inside without effect: it knows no details.
+constexpr float detail_m = 0.03F;
+
+std::vector<float> weights_of(const std::vector<HullSample>& samples, const ShapeRefinementOptions& options) {
+  std::vector<float> weights;
+  weights.reserve(samples.size());
+  for (const HullSample& sample : samples) {
+    const float share = sample.slack_m / static_cast<float>(options.open_m);
+    const float known = std::max(0.0F, 1 - share * share);
+    weights.push_back(known * known * known);
+  }
+  return weights;
+}
+
+/// Takes away from the hull what lies outside the smooth surface.
+Field carve(Field hull, const SmoothDistance& smooth, const std::vector<float>& spared_m, const Work& work) {
+  const Grid& grid = hull.grid();
+  const auto bricks = hull.bricks();
+  const auto voxel_m = static_cast<float>(grid.voxel_m);
+  const float cut_off_m = 2 * voxel_m;  // as the hull's own
+  const auto outside_by = [&](const Eigen::Vector3f& p) { return smooth.at(p) - smooth.interpolate(spared_m, p); };
+  struct Carved {
+    size_t brick;
+    std::vector<float> values;
+  };
+  constexpr float half = 0.5F * (side - 1);
+  // No sample of a brick differs from its middle's distance by more: its diagonal, and the smooth distance's slope.
+  const float reach_m = 1.5F * std::sqrt(3.0F) * half * voxel_m;
+  std::vector<std::vector<Carved>> layers(static_cast<size_t>(bricks[2]));
+  work.parallel_for(layers.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t layer = begin; layer < end; ++layer)
+      for (int y = 0; y < bricks[1]; ++y)
+        for (int x = 0; x < bricks[0]; ++x) {
+          const auto z = static_cast<int>(layer);
+          const size_t brick = hull.brick_index(x, y, z);
+          const int32_t block = hull.brick(brick);
+          if (block == Field::all_outside) continue;
+          const Eigen::Vector3f first = grid.point(x * side, y * side, z * side).cast<float>();
+          if (outside_by(first + Eigen::Vector3f::Constant(half * voxel_m)) < -reach_m - cut_off_m) continue;
+          std::vector<float> values(Field::samples_per_brick, -cut_off_m);
+          if (block >= 0) std::copy_n(hull.block(block), values.size(), values.begin());
+          bool changed = false;
+          size_t s = 0;
+          for (int k = 0; k < side; ++k)
+            for (int j = 0; j < side; ++j)
+              for (int i = 0; i < side; ++i, ++s) {
+                if (values[s] >= 0) continue;
+                const Eigen::Vector3f p =
+                    first +
+                    voxel_m * Eigen::Vector3f(static_cast<float>(i), static_cast<float>(j), static_cast<float>(k));
+                const float carved = std::min(outside_by(p), cut_off_m);
+                if (carved <= values[s]) continue;
+                values[s] = carved;
+                changed = true;
+              }
+          if (changed) layers[layer].push_back({brick, std::move(values)});
+        }
+  });
+  size_t added = 0;
+  for (const auto& layer : layers)
+    for (const Carved& carved : layer) added += hull.brick(carved.brick) < 0;
+  Field result(grid);
+  result.allocate_blocks(hull.blocks() + added);
+  if (hull.blocks() > 0) std::copy_n(hull.block(0), hull.blocks() * Field::samples_per_brick, result.block(0));
+  const size_t count = static_cast<size_t>(bricks[0]) * static_cast<size_t>(bricks[1]) * static_cast<size_t>(bricks[2]);
+  for (size_t brick = 0; brick < count; ++brick) result.set_brick(brick, hull.brick(brick));
+  auto next = static_cast<int32_t>(hull.blocks());
+  for (const auto& layer : layers)
+    for (const Carved& carved : layer) {
+      if (result.brick(carved.brick) < 0) result.set_brick(carved.brick, next++);
+      std::copy(carved.values.begin(), carved.values.end(), result.block(result.brick(carved.brick)));
+    }
+  return result;
+}
+
+}  // namespace
+
+Field refine_shape(Field hull, const SilhouetteViews& views, const ShapeRefinementOptions& options, const Work& work) {
+  if (!options.enabled) return hull;
+  std::vector<HullSample> samples = sample_hull(hull, cell_m);
+  if (samples.empty()) return hull;
+  measure_slack(hull, views, samples, work);
+  std::vector<float> weights = weights_of(samples, options);
+
+  constexpr int coarsest_iterations = 100, iterations = 16;
+  SmoothDistance coarse(hull, samples, {4 * cell_m, options.stiffness, coarsest_iterations});
+  SmoothDistance middle(hull, samples, {2 * cell_m, options.stiffness, iterations});
+  SmoothDistance fine(hull, samples, {cell_m, options.stiffness, iterations});
+
+  std::vector<float> spared;
+  for (const HullSample& sample : samples) {
+    const float open = sample.slack_m / static_cast<float>(options.sure_m) - 1;
+    const float sure = std::clamp(1 - open, 0.0F, 1.0F);
+    spared.push_back(detail_m * sure * sure);
+  }
+  const std::vector<float> spared_m = fine.spread(spared);
+  coarse.solve(weights, nullptr, work);
+  middle.solve(weights, &coarse, work);
+  fine.solve(weights, &middle, work);
+  if (work.stopped()) return hull;
+  Field refined = carve(std::move(hull), fine, spared_m, work);
+  keep_largest_part(refined, work);
+  return refined;
+}
+
+}  // namespace booth
