@@ -72,8 +72,8 @@ class Sampling {
 
 /// Nearer to the outline than this, a point of the hull may be the ray's contact.
 constexpr float contact_m = 0.002F;
-/// A ray that passes the hull by less than the first grazes it, and by less than the second is taken to graze it somewhere else:
-/// silhouettes and calibration do not agree to the millimetre.
+/// A ray that passes the hull by less than the first grazes it, and by less than the second is taken to graze it
+/// somewhere else: silhouettes and calibration do not agree to the millimetre.
 constexpr float grazed_m = 0.0015F, grazed_elsewhere_m = 0.006F;
 /// By which limbs bend, and the edges of what is broader: where silhouettes leave a surface open.
 constexpr float bend_radius_m = 0.06F;

@@ -9,7 +9,7 @@ namespace booth {
 struct ShapeRefinementOptions {
   bool enabled = true;      ///< false: the hull as it is
   double sure_m = 0.0007;   ///< hull that is off by at most this stays as it is
-  double open_m = 0.008;    ///< hull that may be off by more than this says nothing about the surface
+  double open_m = 0.012;    ///< hull that may be off by more than this says nothing about the surface
   double stiffness = 0.01;  ///< of the surface where the hull is open, against what holds it
 };
 
