@@ -55,6 +55,7 @@ struct Inputs {
   FrameSet body;
   std::vector<Silhouette> silhouettes;
   VisualHull hull;
+  Field shape;
   Mesh surface, mesh;
   Avatar avatar;
 
@@ -64,7 +65,9 @@ struct Inputs {
     load();
     segment_all();
     hull = must(carve_visual_hull(recording.rig, silhouettes, options.hull, work));
-    surface = smooth_hc(extract_surface(hull.field, work), options.smoothing, work);
+    shape = refine_shape(hull.field, hull.views, options.refinement, work);
+    remove_small_handles(shape, options.handles, work);
+    surface = smooth_hc(extract_surface(shape, work), options.smoothing, work);
     mesh = decimate(surface, options.decimation, work);
     avatar.mesh = mesh;
     avatar.atlas = must(build_texture_atlas(mesh, recording.rig, body.frames, silhouettes, options.atlas, work)).atlas;
@@ -123,7 +126,11 @@ BOOTH_STAGE(load, in.load());
 BOOTH_STAGE(segmentation, in.segment_all());
 BOOTH_STAGE(hull,
             benchmark::DoNotOptimize(carve_visual_hull(in.recording.rig, in.silhouettes, in.options.hull, in.work)));
-BOOTH_STAGE(surface_extraction, benchmark::DoNotOptimize(extract_surface(in.hull.field, in.work)));
+BOOTH_STAGE(shape_refinement,
+            benchmark::DoNotOptimize(refine_shape(in.hull.field, in.hull.views, in.options.refinement, in.work)));
+BOOTH_STAGE(handle_removal, Field shape = in.shape;
+            benchmark::DoNotOptimize(remove_small_handles(shape, in.options.handles, in.work)));
+BOOTH_STAGE(surface_extraction, benchmark::DoNotOptimize(extract_surface(in.shape, in.work)));
 BOOTH_STAGE(surface_decimation, benchmark::DoNotOptimize(decimate(in.surface, in.options.decimation, in.work)));
 BOOTH_STAGE(atlas, benchmark::DoNotOptimize(build_texture_atlas(in.mesh, in.recording.rig, in.body.frames,
                                                                 in.silhouettes, in.options.atlas, in.work)));
