@@ -9,6 +9,7 @@ namespace {
 constexpr size_t most_readings = 64;
 constexpr size_t most_arrivals = 64;
 constexpr Timestamp shortest_baseline = seconds(1);  ///< between two readings that tell the drift
+constexpr double residual_drift = 50e-6;             ///< that may be left when the drift is estimated
 constexpr double largest_drift = 500e-6;             ///< of any quartz; what seems more is a mistaken reading
 
 }  // namespace
@@ -21,6 +22,8 @@ void DeviceClock::note_reading(int64_t device_ns, Timestamp before, Timestamp af
     if (*expected < before - tolerance || *expected > after + tolerance) {
       readings_.clear();
       drift_ = 0;
+    } else if (after - before > 2 * uncertainty_ns() + static_cast<Timestamp>(residual_drift * elapsed)) {
+      return;  // what is known already is better
     }
   }
   readings_.push_back({device_ns, before + (after - before) / 2, (after - before + 1) / 2});

@@ -14,7 +14,8 @@ namespace booth {
 /// between question and answer. Where a camera cannot be asked, the arrivals of its frames bound it from one side.
 class DeviceClock {
  public:
-  /// The device's clock showed `device_ns` at some instant from `before` to `after`.
+  /// The device's clock showed `device_ns` at some instant from `before` to `after`. A reading that is less certain
+  /// than what is known, and agrees with it, is left out.
   void note_reading(int64_t device_ns, Timestamp before, Timestamp after);
   /// Something that happened at `device_ns` had arrived here by `arrival`; counts only without readings.
   void note_arrival(int64_t device_ns, Timestamp arrival);

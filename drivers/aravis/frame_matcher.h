@@ -18,9 +18,9 @@ class FrameMatcher {
     /// A frame's exposure begins this much before its trigger at the earliest (clocks are not perfect), …
     Timestamp early_ns = milliseconds(5);
     /// … and this much after it at the latest.
-    Timestamp late_ns = milliseconds(100);
+    Timestamp late_ns = milliseconds(250);
     /// How long after the beginning of its exposure a frame is kept waiting for its trigger to be noted.
-    Timestamp patience_ns = milliseconds(250);
+    Timestamp patience_ns = milliseconds(400);
   };
   enum class Verdict {
     answers,   ///< trigger `index`

@@ -114,6 +114,14 @@ TEST(DeviceClock, FollowsAClockThatRunsFast) {
   EXPECT_NEAR(static_cast<double>(*clock.device_time(later) - device(later)), 0, 10'000);
 }
 
+TEST(DeviceClock, ASlowAnswerDoesNotReplaceAQuickOne) {
+  DeviceClock clock;
+  clock.note_reading(seconds(5), seconds(100) - 10'000, seconds(100) + 10'000);
+  clock.note_reading(seconds(6), seconds(101) - milliseconds(80), seconds(101) + milliseconds(1));
+  EXPECT_EQ(*clock.host_time(seconds(6)), seconds(101));
+  EXPECT_EQ(clock.uncertainty_ns(), 10'000);
+}
+
 TEST(DeviceClock, AClockThatWasSetIsBelievedAtOnce) {
   DeviceClock clock;
   clock.note_reading(seconds(5), seconds(100), seconds(100) + 1000);
