@@ -3,8 +3,8 @@
 //   gige_benchmark [SECONDS]
 //
 // Prints, a line each: frames a second sustained and dropped, and processor time per gigabyte, of the driver and of
-// arv-camera-test (Debian package aravis-tools; left out where it is not installed) from the same camera; the time from
-// a trigger to the last of three cameras' frames; the time from a camera's return to its first frame.
+// arv-camera-test --auto (Debian package aravis-tools; left out where it is not installed) from the same camera; the
+// time from a trigger to the last of three cameras' frames; the time from a camera's return to its first frame.
 
 #include <fcntl.h>
 #include <sys/resource.h>
@@ -172,7 +172,7 @@ void measure_their_throughput(int duration_s) {
     dup2(output[1], STDOUT_FILENO);
     close(output[0]);
     execlp("arv-camera-test-0.8", "arv-camera-test-0.8", "--name", name.c_str(), "--duration", duration.c_str(),
-           "--frequency", rate.c_str(), "--exposure", "1000", "--no-packet-socket", size.c_str(), nullptr);
+           "--frequency", rate.c_str(), "--exposure", "1000", "--no-packet-socket", "--auto", size.c_str(), nullptr);
     _exit(127);
   }
   close(output[1]);
