@@ -5,7 +5,6 @@
 #include <bit>
 #include <cmath>
 #include <cstdint>
-#include <limits>
 #include <vector>
 
 namespace booth {
@@ -290,6 +289,8 @@ class Growth {
 size_t flip_small_layers(Field& field, bool inside, double area_m2, const Work& work) {
   const auto parts = Growth(field, inside, work).run();
   const double sample_m2 = field.grid().voxel_m * field.grid().voxel_m;
+  // Half a voxel from the surface: nearer, opposite sides of a cut would touch once they are smoothed.
+  const auto flipped_m = static_cast<float>(0.5 * field.grid().voxel_m);
   size_t flipped = 0;
   for (const auto& part : parts) {
     if (static_cast<double>(part.size()) * sample_m2 > area_m2) continue;
@@ -297,7 +298,7 @@ size_t flip_small_layers(Field& field, bool inside, double area_m2, const Work& 
       const int32_t block = field.brick(field.brick_index(i / side, j / side, k / side));
       if (block < 0) continue;
       float& value = field.block(block)[((k % side) * side + j % side) * side + i % side];
-      value = inside ? std::numeric_limits<float>::min() : -std::numeric_limits<float>::min();
+      value = inside ? flipped_m : -flipped_m;
       ++flipped;
     }
   }

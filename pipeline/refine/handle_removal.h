@@ -21,7 +21,7 @@ struct RemovedHandles {
 ///
 /// The inside is grown from one cell, deepest first, by cells that do not change the topology; where two fronts of it
 /// would meet, a layer of one sample is left, which cuts each ring once. The same with the outside gives one cover for
-/// each opening. A small layer changes sides, with a magnitude next to nothing.
+/// each opening. A small layer changes sides, half a voxel from the surface.
 ///
 /// @param field  one connected part without cavities
 /// Source: simple points after G. Bertrand, G. Malandain, "A new characterization of three-dimensional simple points",
