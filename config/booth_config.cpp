@@ -3,8 +3,13 @@
 #include <toml++/toml.h>
 #include <algorithm>
 #include <array>
+#include <charconv>
 #include <cmath>
+#include <iomanip>
+#include <limits>
+#include <set>
 #include <sstream>
+#include <system_error>
 #include <utility>
 
 #include "replay/durable_folder.h"
@@ -17,11 +22,16 @@ namespace fs = std::filesystem;
 template <class Value>
 using Words = std::vector<std::pair<std::string_view, Value>>;
 
+/// "NAME=VALUE" texts.
+using Assignments = std::vector<std::pair<std::string, std::string>>;
+
+constexpr size_t longest_name = 64;
+constexpr size_t longest_path = 4000;
+
 // What can be set, one function a section. A visitor reads it, writes it or lists it, so that the three agree.
 
 template <class Visitor>
 void visit_booth(Visitor& visitor, IdentityConfig& booth) {
-  constexpr size_t longest_name = 64;
   visitor.text("name", booth.name, longest_name);
   visitor.path("state_directory", booth.state_directory);
 }
@@ -36,6 +46,8 @@ template <class Visitor>
 void visit_capture(Visitor& visitor, CaptureConfig& capture) {
   using Format = SpoolOptions::Format;
   visitor.integer("frame_timeout_ms", capture.frame_timeout_ms, 50, 60000);
+  visitor.integer("retries", capture.retries, 0, 5);
+  visitor.integer("max_skew_ms", capture.max_skew_ms, 1, 60000);
   visitor.integer("min_cameras", capture.min_cameras, 1, 256);
   visitor.integer("background_frames", capture.background_frames, 1, 100);
   visitor.choice("image_format", capture.images.format, Words<Format>{{"png", Format::png}, {"jpeg", Format::jpeg}});
@@ -68,8 +80,213 @@ void visit_log(Visitor& visitor, LogConfig& log) {
 }
 
 template <class Visitor>
-void visit_drivers(Visitor& visitor, DriversConfig& drivers) {
-  visitor.choice("camera", drivers.camera, Words<std::string>{{"replay", "replay"}});
+void visit_aravis(Visitor& visitor, AravisCameraSettings& camera) {
+  using Response = AravisResponse;
+  using Trigger = AravisTriggerSource;
+  using Activation = AravisActivation;
+  constexpr double longest_exposure_us = 10'000'000;
+  visitor.any_text("serial", camera.serial, longest_name);
+  visitor.any_text("address", camera.address, longest_name);
+  visitor.number("exposure_us", camera.exposure_us, 1, longest_exposure_us);
+  visitor.number("gain_db", camera.gain_db, 0, 60);
+  visitor.optional_number("pattern_exposure_us", camera.pattern_exposure_us, 1, longest_exposure_us);
+  visitor.optional_number("pattern_gain_db", camera.pattern_gain_db, 0, 60);
+  visitor.optional_number("white_balance_red", camera.white_balance_red, 0.1, 16);
+  visitor.optional_number("white_balance_blue", camera.white_balance_blue, 0.1, 16);
+  visitor.choice("response", camera.response, Words<Response>{{"linear", Response::linear}, {"srgb", Response::srgb}});
+  Words<std::string> formats;
+  for (const char* format : {"Mono8", "BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8", "RGB8"})
+    formats.emplace_back(format, format);
+  visitor.choice("pixel_format", camera.pixel_format, formats);
+  constexpr int widest = 65535;
+  visitor.integer("region_x", camera.region.x, 0, widest);
+  visitor.integer("region_y", camera.region.y, 0, widest);
+  visitor.integer("region_width", camera.region.width, 0, widest);
+  visitor.integer("region_height", camera.region.height, 0, widest);
+  visitor.choice("trigger", camera.trigger,
+                 Words<Trigger>{{"line", Trigger::line}, {"software", Trigger::software}, {"action", Trigger::action}});
+  visitor.text("trigger_line", camera.trigger_line, longest_name);
+  visitor.text("trigger_selector", camera.trigger_selector, longest_name);
+  visitor.choice("activation", camera.activation,
+                 Words<Activation>{{"rising_edge", Activation::rising_edge},
+                                   {"falling_edge", Activation::falling_edge},
+                                   {"any_edge", Activation::any_edge},
+                                   {"level_high", Activation::level_high},
+                                   {"level_low", Activation::level_low}});
+  visitor.number("trigger_delay_us", camera.trigger_delay_us, 0, 1'000'000);
+  visitor.integer("action", camera.action, 0, 31);
+  visitor.number("preview_fps", camera.preview_fps, 1, 60);
+  visitor.integer("packet_size", camera.packet_size, 0, 16384);
+  visitor.integer("packet_delay_ns", camera.packet_delay_ns, 0, 1'000'000'000);
+  visitor.boolean("packet_resend", camera.packet_resend);
+  visitor.number("resend_ratio", camera.resend_ratio, 0, 1);
+  visitor.integer("packet_timeout_ms", camera.packet_timeout_ms, 1, 1000);
+  visitor.integer("frame_retention_ms", camera.frame_retention_ms, 1, 10'000);
+  visitor.integer("socket_buffer_kib", camera.socket_buffer_kib, 64, 1'048'576);
+  visitor.boolean("packet_socket", camera.packet_socket);
+  visitor.integer("buffers", camera.buffers, 0, 256);
+  visitor.integer("heartbeat_ms", camera.heartbeat_ms, 500, 60'000);
+  visitor.boolean("ptp", camera.ptp);
+  Assignments features;
+  for (const AravisFeature& feature : camera.features) features.emplace_back(feature.name, feature.value);
+  visitor.assignments("features", features, [](const std::string& value) { return !value.empty(); });
+  camera.features.clear();
+  for (const auto& [name, value] : features) camera.features.push_back({name, value});
+}
+
+std::optional<int64_t> whole_number(const std::string& text) {
+  int64_t number = 0;
+  const auto [end, fault] = std::from_chars(text.data(), text.data() + text.size(), number);
+  if (fault != std::errc() || end != text.data() + text.size()) return std::nullopt;
+  return number;
+}
+
+template <class Visitor>
+void visit_v4l2(Visitor& visitor, V4l2CameraSettings& camera) {
+  visitor.any_text("device", camera.device, longest_path);
+  visitor.any_text("serial", camera.serial, longest_name);
+  visitor.any_text("bus", camera.bus, longest_name);
+  Words<V4l2Format> formats;
+  for (const V4l2Format format :
+       {V4l2Format::automatic, V4l2Format::mjpg, V4l2Format::yuyv, V4l2Format::grey, V4l2Format::bayer_rggb,
+        V4l2Format::bayer_grbg, V4l2Format::bayer_gbrg, V4l2Format::bayer_bggr})
+    formats.emplace_back(to_string(format), format);
+  visitor.choice("format", camera.format, formats);
+  visitor.integer("width", camera.width, 0, 65535);
+  visitor.integer("height", camera.height, 0, 65535);
+  visitor.number("fps", camera.fps, 0, 1000);
+  visitor.optional_integer("exposure_us", camera.exposure_us, 100, 10'000'000);
+  visitor.optional_integer("gray_code_exposure_us", camera.gray_code_exposure_us, 100, 10'000'000);
+  visitor.optional_integer("gain", camera.gain, 0, 1'000'000);
+  visitor.optional_integer("white_balance_k", camera.white_balance_k, 1000, 20'000);
+  visitor.optional_integer("focus", camera.focus, 0, 1'000'000);
+  Assignments controls;
+  for (const auto& [name, value] : camera.controls) controls.emplace_back(name, std::to_string(value));
+  visitor.assignments("controls", controls, [](const std::string& value) { return whole_number(value).has_value(); });
+  camera.controls.clear();
+  for (const auto& [name, value] : controls) camera.controls[name] = *whole_number(value);
+  visitor.integer("buffers", camera.buffers, 2, 32);
+  visitor.integer("warm_up_frames", camera.warm_up_frames, 0, 100);
+  visitor.integer("latency_us", camera.latency_us, 0, 1'000'000);
+  visitor.integer("max_offset_ms", camera.max_offset_ms, 1, 60'000);
+}
+
+/// The drivers of cameras, in the order of CameraConfig::driver.
+constexpr std::array<std::string_view, 3> camera_drivers{"replay", "aravis", "v4l2"};
+
+template <class Visitor>
+void visit_camera(Visitor& visitor, CameraConfig& camera) {
+  visitor.id("id", camera.id);
+  size_t driver = camera.driver.index();
+  Words<size_t> drivers;
+  for (size_t i = 0; i < camera_drivers.size(); ++i) drivers.emplace_back(camera_drivers[i], i);
+  visitor.choice("driver", driver, drivers);
+  if (driver != camera.driver.index()) {
+    if (driver == 0) camera.driver = ReplayCameraSettings{};
+    if (driver == 1) camera.driver = AravisCameraSettings{};
+    if (driver == 2) camera.driver = V4l2CameraSettings{};
+  }
+  visitor.choice("role", camera.role, Words<CameraRole>{{"body", CameraRole::body}, {"face", CameraRole::face}});
+  visitor.choice("mount_rotation", camera.mount_rotation_deg,
+                 Words<int>{{"0", 0}, {"90", 90}, {"180", 180}, {"270", 270}});
+  if (auto* aravis = std::get_if<AravisCameraSettings>(&camera.driver)) {
+    visit_aravis(visitor, *aravis);
+    aravis->id = camera.id;
+    aravis->role = camera.role;
+  }
+  if (auto* v4l2 = std::get_if<V4l2CameraSettings>(&camera.driver)) {
+    visit_v4l2(visitor, *v4l2);
+    v4l2->id = camera.id;
+    v4l2->role = camera.role;
+  }
+}
+
+/// A GPIO line's keys, "PREFIXchip" and so on.
+template <class Visitor>
+void visit_line(Visitor& visitor, const std::string& prefix, GpioLineSettings& line) {
+  visitor.any_text((prefix + "chip").c_str(), line.chip, longest_path);
+  visitor.any_text((prefix + "line").c_str(), line.line, longest_name);
+  visitor.choice((prefix + "active").c_str(), line.active,
+                 Words<ActiveLevel>{{"high", ActiveLevel::high}, {"low", ActiveLevel::low}});
+}
+
+Words<ShotRole> shot_roles() {
+  Words<ShotRole> roles;
+  for (const ShotRole role : {ShotRole::background, ShotRole::body, ShotRole::gray_code, ShotRole::calibration_board})
+    roles.emplace_back(to_string(role), role);
+  return roles;
+}
+
+template <class Visitor>
+void visit_trigger(Visitor& visitor, TriggerConfig& trigger) {
+  using Driver = TriggerDriver;
+  visitor.choice(
+      "driver", trigger.driver,
+      Words<Driver>{
+          {"replay", Driver::replay}, {"gpio", Driver::gpio}, {"aravis", Driver::aravis}, {"none", Driver::none}});
+  visitor.section("gpio", [&](auto& section) {
+    GpioTriggerSettings& gpio = trigger.gpio;
+    visit_line(section, "", gpio.trigger);
+    section.integer("pulse_us", gpio.pulse_us, 10, 100'000);
+    GpioLineSettings lights = gpio.lights.value_or(GpioLineSettings{});
+    visit_line(section, "lights_", lights);
+    gpio.lights.reset();
+    if (!lights.chip.empty() || !lights.line.empty()) gpio.lights = lights;
+    section.integer("lights_lead_us", gpio.lights_lead_us, 0, 1'000'000);
+    section.integer("lights_hold_us", gpio.lights_hold_us, 0, 1'000'000);
+    section.choices("lit", gpio.lit_roles, shot_roles());
+  });
+  visitor.section("action", [&](auto& section) {
+    AravisActionSettings& action = trigger.action;
+    constexpr int64_t widest = 0xffffffff;
+    section.integer("device_key", action.device_key, 0, widest);
+    section.integer("group_key", action.group_key, 0, widest);
+    section.integer("group_mask", action.group_mask, 1, widest);
+    section.texts("destinations", action.destinations, longest_name);
+    section.integer("schedule_ahead_us", action.schedule_ahead_us, 0, 1'000'000);
+    section.integer("acknowledge_timeout_ms", action.acknowledge_timeout_ms, 1, 10'000);
+  });
+}
+
+template <class Visitor>
+void visit_pattern(Visitor& visitor, GrayCodePattern& pattern) {
+  visitor.integer("pattern_width", pattern.width, 0, 16384);
+  visitor.integer("pattern_height", pattern.height, 0, 16384);
+  visitor.boolean("pattern_columns", pattern.columns);
+  visitor.boolean("pattern_rows", pattern.rows);
+  visitor.boolean("pattern_inverse", pattern.inverse);
+}
+
+template <class Visitor>
+void visit_projector(Visitor& visitor, ProjectorConfig& projector) {
+  using Driver = ProjectorDriver;
+  visitor.choice(
+      "driver", projector.driver,
+      Words<Driver>{
+          {"replay", Driver::replay}, {"display", Driver::display}, {"gpio", Driver::gpio}, {"none", Driver::none}});
+  visitor.section("gpio", [&](auto& section) {
+    GpioProjectorSettings& gpio = projector.gpio;
+    section.id("id", gpio.id);
+    visit_pattern(section, gpio.pattern);
+    visit_line(section, "step_", gpio.step);
+    visit_line(section, "reset_", gpio.reset);
+    section.integer("pulse_us", gpio.pulse_us, 10, 100'000);
+    section.integer("pause_us", gpio.pause_us, 10, 1'000'000);
+    section.integer("settle_us", gpio.settle_us, 0, 1'000'000);
+  });
+  visitor.section("display", [&](auto& section) {
+    DisplaySettings& display = projector.display;
+    section.id("id", display.id);
+    section.any_text("card", display.card, longest_path);
+    section.any_text("connector", display.connector, longest_name);
+    section.integer("width", display.width, 0, 16384);
+    section.integer("height", display.height, 0, 16384);
+    section.number("refresh_hz", display.refresh_hz, 0, 1000);
+    visit_pattern(section, display.pattern);
+    section.integer("delay_us", display.delay_us, 0, 1'000'000);
+    section.number("brightness", display.brightness, 0.01, 1);
+    section.number("gamma", display.gamma, 1, 4);
+  });
 }
 
 template <class Visitor>
@@ -81,8 +298,7 @@ void visit_fault(Visitor& visitor, ReplayFault& fault) {
       Words<Kind>{{"missing", Kind::missing}, {"late", Kind::late}, {"corrupt", Kind::corrupt}, {"lost", Kind::lost}});
   visitor.camera("camera", fault.camera);
   Words<std::optional<ShotRole>> roles{{"any", std::nullopt}};
-  for (const ShotRole role : {ShotRole::background, ShotRole::body, ShotRole::gray_code, ShotRole::calibration_board})
-    roles.emplace_back(to_string(role), role);
+  for (const auto& [name, role] : shot_roles()) roles.emplace_back(name, role);
   visitor.choice("role", fault.role, roles);
   visitor.optional_integer("index", fault.index, 0, most);
   visitor.optional_integer("capture", fault.capture, 0, most);
@@ -95,7 +311,8 @@ void visit_replay(Visitor& visitor, ReplayOptions& replay) {
   visitor.path("recording", replay.recording);
   visitor.choice("pace", replay.pace, Words<Pace>{{"real", Pace::real}, {"fast", Pace::fast}});
   visitor.integer("cache_mib", replay.cache_mib, 0, 65536);
-  visitor.list("faults", replay.faults, [](auto& element, ReplayFault& fault) { visit_fault(element, fault); });
+  visitor.list("faults", replay.faults, std::vector<ReplayFault>(1),
+               [](auto& element, ReplayFault& fault) { visit_fault(element, fault); });
 }
 
 template <class Visitor>
@@ -130,7 +347,13 @@ void visit_config(Visitor& visitor, BoothConfig& config) {
   visitor.section("disk", [&](auto& section) { visit_disk(section, config.disk); });
   visitor.section("jobs", [&](auto& section) { visit_jobs(section, config.jobs); });
   visitor.section("log", [&](auto& section) { visit_log(section, config.log); });
-  visitor.section("drivers", [&](auto& section) { visit_drivers(section, config.drivers); });
+  std::vector<CameraConfig> one_of_each_driver(camera_drivers.size());
+  one_of_each_driver[1].driver = AravisCameraSettings{};
+  one_of_each_driver[2].driver = V4l2CameraSettings{};
+  visitor.list("cameras", config.cameras, one_of_each_driver,
+               [](auto& element, CameraConfig& camera) { visit_camera(element, camera); });
+  visitor.section("trigger", [&](auto& section) { visit_trigger(section, config.trigger); });
+  visitor.section("projector", [&](auto& section) { visit_projector(section, config.projector); });
   visitor.section("replay", [&](auto& section) { visit_replay(section, config.replay); });
   visitor.section("reconstruct", [&](auto& section) { visit_reconstruct(section, config.reconstruct); });
   visitor.section("export", [&](auto& section) { visit_export(section, config.files); });
@@ -163,6 +386,8 @@ std::string listed(const Words<Value>& words) {
 
 std::string range(const std::string& lowest, const std::string& highest) { return lowest + " … " + highest; }
 
+constexpr size_t most_texts = 64;  ///< of an array
+
 /// Takes what a table holds into the options and notes everything that is wrong.
 class Reader {
  public:
@@ -181,7 +406,7 @@ class Reader {
   }
 
   template <class Element, class Visit>
-  void list(const char* key, std::vector<Element>& elements, const Visit& visit) {
+  void list(const char* key, std::vector<Element>& elements, const std::vector<Element>&, const Visit& visit) {
     const toml::node* node = take(key);
     if (node == nullptr) return;
     const toml::array* array = node->as_array();
@@ -211,12 +436,78 @@ class Reader {
     value = *text;
   }
 
+  void any_text(const char* key, std::string& value, size_t longest) {
+    const toml::node* node = take(key);
+    if (node == nullptr) return;
+    const auto text = node->value_exact<std::string>();
+    if (!text || text->size() > longest || has_control(*text))
+      return refuse(key, *node, "a text of at most " + std::to_string(longest) + " bytes on one line");
+    value = *text;
+  }
+
+  void id(const char* key, std::string& value) {
+    const toml::node* node = take(key);
+    if (node == nullptr) return;
+    const auto text = node->value_exact<std::string>();
+    if (!text || !is_safe_id(*text))
+      return refuse(key, *node, "an id: 1 … 64 letters, digits, '-', '_' and '.', not beginning with '.'");
+    value = *text;
+  }
+
+  void texts(const char* key, std::vector<std::string>& values, size_t longest) {
+    const toml::node* node = take(key);
+    if (node == nullptr) return;
+    std::vector<std::string> taken;
+    const std::string expected =
+        "an array of at most " + std::to_string(most_texts) + " texts of 1 … " + std::to_string(longest) + " bytes";
+    const toml::array* array = node->as_array();
+    if (array == nullptr || array->size() > most_texts) return refuse(key, *node, expected);
+    for (const toml::node& element : *array) {
+      const auto text = element.value_exact<std::string>();
+      if (!text || text->empty() || text->size() > longest || has_control(*text)) return refuse(key, element, expected);
+      taken.push_back(*text);
+    }
+    values = taken;
+  }
+
+  template <class IsValue>
+  void assignments(const char* key, Assignments& values, const IsValue& is_value) {
+    std::vector<std::string> written;
+    const toml::node* node = table_.get(key);
+    texts(key, written, longest_path);
+    if (node == nullptr) return;
+    Assignments taken;
+    for (const std::string& text : written) {
+      const size_t equals = text.find('=');
+      if (equals == 0 || equals == std::string::npos || !is_value(text.substr(equals + 1)))
+        return refuse(key, *node, "an array of texts NAME=VALUE");
+      taken.emplace_back(text.substr(0, equals), text.substr(equals + 1));
+    }
+    values = taken;
+  }
+
+  void number(const char* key, double& value, double lowest, double highest) {
+    const toml::node* node = take(key);
+    if (node == nullptr) return;
+    const auto number = node->value<double>();
+    if (!node->is_number() || !number || !(*number >= lowest && *number <= highest))
+      return refuse(key, *node, range(written(lowest), written(highest)));
+    value = *number;
+  }
+
+  void optional_number(const char* key, std::optional<double>& value, double lowest, double highest) {
+    if (!table_.contains(key)) return known_.push_back(key);
+    double set = lowest;
+    number(key, set, lowest, highest);
+    value = set;
+  }
+
   void path(const char* key, fs::path& value) {
     const toml::node* node = take(key);
     if (node == nullptr) return;
     const auto text = node->value_exact<std::string>();
-    constexpr size_t longest = 4000;
-    if (!text || text->empty() || text->size() > longest || has_control(*text)) return refuse(key, *node, "a path");
+    if (!text || text->empty() || text->size() > longest_path || has_control(*text))
+      return refuse(key, *node, "a path");
     value = (folder_ / *text).lexically_normal();
   }
 
@@ -269,13 +560,11 @@ class Reader {
   }
 
   void millimetres(const char* key, double& value_m, double lowest_mm, double highest_mm) {
-    const toml::node* node = take(key);
-    if (node == nullptr) return;
-    const auto number = node->value<double>();
-    if (!node->is_number() || !number || !(*number >= lowest_mm && *number <= highest_mm))
-      return refuse(key, *node, range(written(lowest_mm), written(highest_mm)));
     constexpr double mm_per_m = 1000;
-    value_m = *number / mm_per_m;
+    double value_mm = value_m * mm_per_m;
+    const bool set = table_.contains(key);
+    number(key, value_mm, lowest_mm, highest_mm);
+    if (set) value_m = value_mm / mm_per_m;
   }
 
   template <class Value>
@@ -324,7 +613,7 @@ class Reader {
   }
   static std::string written(double number) {
     std::ostringstream text;
-    text << number;
+    text << std::setprecision(std::numeric_limits<double>::digits10) << number;
     return text.str();
   }
 
@@ -349,19 +638,38 @@ class Writer {
  public:
   template <class Visit>
   void section(const char* key, const Visit& visit) {
-    text_ << (path_.empty() && text_.tellp() > 0 ? "\n[" : "[") << key << "]\n";
-    path_ = key;
+    const std::string outer = std::exchange(path_, path_.empty() ? key : path_ + "." + key);
+    text_ << (text_.tellp() > 0 ? "\n[" : "[") << path_ << "]\n";
     visit(*this);
-    path_.clear();
+    path_ = outer;
   }
   template <class Element, class Visit>
-  void list(const char* key, std::vector<Element>& elements, const Visit& visit) {
+  void list(const char* key, std::vector<Element>& elements, const std::vector<Element>&, const Visit& visit) {
     for (Element& element : elements) {
-      text_ << "\n[[" << path_ << "." << key << "]]\n";
+      text_ << "\n[[" << (path_.empty() ? key : path_ + "." + key) << "]]\n";
       visit(*this, element);
     }
   }
   void text(const char* key, const std::string& value, size_t) { write_text(key, value); }
+  void any_text(const char* key, const std::string& value, size_t) { write_text(key, value); }
+  void id(const char* key, const std::string& value) { write_text(key, value); }
+  void texts(const char* key, const std::vector<std::string>& values, size_t) {
+    toml::array array;
+    for (const std::string& value : values) array.push_back(value);
+    text_ << key << " = " << array << "\n";
+  }
+  template <class IsValue>
+  void assignments(const char* key, const Assignments& values, const IsValue&) {
+    std::vector<std::string> lines;
+    for (const auto& [name, value] : values) lines.push_back(name + "=" + value);
+    texts(key, lines, longest_path);
+  }
+  void number(const char* key, double value, double, double) {
+    text_ << key << " = " << toml::value<double>(value) << "\n";
+  }
+  void optional_number(const char* key, const std::optional<double>& value, double lowest, double highest) {
+    if (value) number(key, *value, lowest, highest);
+  }
   void path(const char* key, const fs::path& value) { write_text(key, value.string()); }
   void endpoint(const char* key, const std::string& value) { write_text(key, value); }
   void camera(const char* key, const std::string& value) { write_text(key, value); }
@@ -406,18 +714,26 @@ class Lister {
  public:
   template <class Visit>
   void section(const char* key, const Visit& visit) {
-    path_ = std::string(key) + ".";
+    const std::string outer = std::exchange(path_, path_ + key + ".");
     visit(*this);
+    path_ = outer;
   }
   template <class Element, class Visit>
-  void list(const char* key, std::vector<Element>&, const Visit& visit) {
-    Lister inside;
-    inside.path_ = path_ + key + "[].";
-    Element element;
-    visit(inside, element);
-    keys.insert(keys.end(), inside.keys.begin(), inside.keys.end());
+  void list(const char* key, std::vector<Element>&, std::vector<Element> examples, const Visit& visit) {
+    const std::string outer = std::exchange(path_, path_ + key + "[].");
+    for (Element& example : examples) visit(*this, example);
+    path_ = outer;
   }
   void text(const char* key, const std::string&, size_t) { add(key); }
+  void any_text(const char* key, const std::string&, size_t) { add(key); }
+  void id(const char* key, const std::string&) { add(key); }
+  void texts(const char* key, const std::vector<std::string>&, size_t) { add(key); }
+  template <class IsValue>
+  void assignments(const char* key, const Assignments&, const IsValue&) {
+    add(key);
+  }
+  void number(const char* key, double, double, double) { add(key); }
+  void optional_number(const char* key, const std::optional<double>&, double, double) { add(key); }
   void path(const char* key, const fs::path&) { add(key); }
   void endpoint(const char* key, const std::string&) { add(key); }
   void camera(const char* key, const std::string&) { add(key); }
@@ -444,15 +760,63 @@ class Lister {
   std::string path_;
 };
 
+/// What a driver says of its settings as a whole.
+void note(const Result<void>& checked, const char* path, std::vector<ConfigFault>& faults) {
+  if (!checked) faults.push_back({path, checked.error().message, ""});
+}
+
+void check_cameras(const BoothConfig& config, std::vector<ConfigFault>& faults) {
+  std::set<std::string> ids;
+  bool replayed = config.cameras.empty();
+  for (size_t i = 0; i < config.cameras.size(); ++i) {
+    const CameraConfig& camera = config.cameras[i];
+    const std::string path = "cameras[" + std::to_string(i) + "].id";
+    if (camera.id.empty())
+      faults.push_back({path, "missing", "an id"});
+    else if (!ids.insert(camera.id).second)
+      faults.push_back({path, "\"" + camera.id + "\"", "an id that no other camera has"});
+    replayed |= std::holds_alternative<ReplayCameraSettings>(camera.driver);
+  }
+  if (!faults.empty()) return;
+  const auto [aravis, v4l2] = live_cameras(config);
+  note(check(aravis), "cameras", faults);
+  note(check(v4l2), "cameras", faults);
+  if (config.trigger.driver == TriggerDriver::gpio) note(check(config.trigger.gpio), "trigger.gpio", faults);
+  if (config.trigger.driver == TriggerDriver::replay && !replayed)
+    faults.push_back({"trigger.driver", "\"replay\"", "another one: no camera is replayed"});
+  const bool listens = std::any_of(aravis.cameras.begin(), aravis.cameras.end(),
+                                   [](const auto& camera) { return camera.trigger != AravisTriggerSource::line; });
+  if (config.trigger.driver == TriggerDriver::aravis && !listens)
+    faults.push_back({"trigger.driver", "\"aravis\"", "another one: no camera has the trigger software or action"});
+  if (config.projector.driver == ProjectorDriver::replay && !replayed)
+    faults.push_back({"projector.driver", "\"replay\"", "another one, or \"none\": no camera is replayed"});
+  if (config.projector.driver == ProjectorDriver::gpio) note(check(config.projector.gpio), "projector.gpio", faults);
+  if (config.projector.driver == ProjectorDriver::display)
+    note(check(config.projector.display), "projector.display", faults);
+}
+
 /// What holds between keys.
 void check_together(const BoothConfig& config, std::vector<ConfigFault>& faults) {
   if (config.api.control == config.api.events)
     faults.push_back({"api.events", "\"" + config.api.events + "\"", "another endpoint than api.control"});
   if (config.booth.state_directory.is_relative())
     faults.push_back({"booth.state_directory", config.booth.state_directory.string(), "an absolute path"});
+  check_cameras(config, faults);
 }
 
 }  // namespace
+
+std::pair<AravisSettings, V4l2Settings> live_cameras(const BoothConfig& config) {
+  std::pair<AravisSettings, V4l2Settings> live;
+  live.first.action = config.trigger.action;
+  for (const CameraConfig& camera : config.cameras) {
+    if (const auto* aravis = std::get_if<AravisCameraSettings>(&camera.driver)) live.first.cameras.push_back(*aravis);
+    if (const auto* v4l2 = std::get_if<V4l2CameraSettings>(&camera.driver)) live.second.cameras.push_back(*v4l2);
+  }
+  return live;
+}
+
+std::string_view driver_name(const CameraConfig& camera) { return camera_drivers[camera.driver.index()]; }
 
 std::string ConfigFault::to_string() const {
   return path + ": " + value + (expected.empty() ? "" : ", expected " + expected);

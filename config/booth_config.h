@@ -3,8 +3,14 @@
 #include <filesystem>
 #include <string>
 #include <string_view>
+#include <utility>
+#include <variant>
 #include <vector>
 
+#include "drivers/aravis/aravis_settings.h"
+#include "drivers/display/display_settings.h"
+#include "drivers/gpio/gpio_settings.h"
+#include "drivers/v4l2/v4l2_settings.h"
 #include "pipeline/export/avatar_files.h"
 #include "pipeline/reconstruct.h"
 #include "pipeline/types/result.h"
@@ -21,6 +27,7 @@ struct IdentityConfig {
   std::filesystem::path backgrounds() const { return state_directory / "backgrounds"; }
   std::filesystem::path jobs() const { return state_directory / "jobs"; }
   std::filesystem::path avatars() const { return state_directory / "avatars"; }
+  std::filesystem::path rig() const { return state_directory / "calibration" / "rig.json"; }
 };
 
 struct ApiConfig {
@@ -29,10 +36,12 @@ struct ApiConfig {
 };
 
 struct CaptureConfig {
-  int frame_timeout_ms = 2000;  ///< how long after a trigger a frame may arrive, 50 … 60000
-  int min_cameras = 3;          ///< body cameras that must deliver, or the capture fails, 1 … 256
-  int background_frames = 10;   ///< of background.learn without a number, 1 … 100
-  SpoolOptions images;          ///< how recordings store them
+  int frame_timeout_ms = 220;  ///< how long after a trigger a frame may arrive, 50 … 60000
+  int retries = 1;             ///< triggers in place of one that a camera missed, 0 … 5
+  int max_skew_ms = 100;       ///< how far from its trigger a frame may be exposed, 1 … 60000
+  int min_cameras = 3;         ///< body cameras that must deliver, or the capture fails, 1 … 256
+  int background_frames = 10;  ///< of background.learn without a number, 1 … 100
+  SpoolOptions images;         ///< how recordings store them
 };
 
 struct DiskConfig {
@@ -53,11 +62,47 @@ struct LogConfig {
   LogLevel level = LogLevel::info;
 };
 
-struct DriversConfig {
-  std::string camera = "replay";  ///< also opens the trigger and the projector
+/// A camera that the recording of [replay] plays: the one of the same id.
+struct ReplayCameraSettings {};
+
+struct CameraConfig {
+  std::string id;  ///< is_safe_id; as in the rig
+  CameraRole role = CameraRole::body;
+  int mount_rotation_deg = 0;  ///< see RigCamera; for pictures that people see before the booth is calibrated
+  /// The driver, by its settings; their own id and role are those above.
+  std::variant<ReplayCameraSettings, AravisCameraSettings, V4l2CameraSettings> driver;
+};
+
+enum class TriggerDriver {
+  replay,  ///< of the recording
+  gpio,    ///< a line that is wired to all cameras
+  aravis,  ///< orders and action commands for the Aravis cameras that listen to them
+  none     ///< nothing fires: cameras that stream all the time choose their frames by the instant
+};
+
+struct TriggerConfig {
+  TriggerDriver driver = TriggerDriver::replay;
+  GpioTriggerSettings gpio;
+  AravisActionSettings action;
+};
+
+enum class ProjectorDriver {
+  replay,  ///< of the recording, where it was made with one
+  display,
+  gpio,
+  none
+};
+
+struct ProjectorConfig {
+  ProjectorDriver driver = ProjectorDriver::replay;
+  GpioProjectorSettings gpio;
+  DisplaySettings display;
 };
 
 /// Everything that an operator sets: the options of all modules, composed. What it holds has been checked.
+///
+/// Cameras of several drivers may be mixed. Where cameras are listed, the rig is that of IdentityConfig::rig(); without
+/// any, everything is played from the recording of [replay], its rig included.
 struct BoothConfig {
   IdentityConfig booth;
   ApiConfig api;
@@ -65,11 +110,19 @@ struct BoothConfig {
   DiskConfig disk;
   JobsConfig jobs;
   LogConfig log;
-  DriversConfig drivers;
+  std::vector<CameraConfig> cameras;  ///< none: all that the recording of [replay] has
+  TriggerConfig trigger;
+  ProjectorConfig projector;
   ReplayOptions replay;
   ReconstructionOptions reconstruct;
   AvatarFileOptions files;  ///< section [export]
 };
+
+/// The configured cameras of the live drivers, as these take them.
+std::pair<AravisSettings, V4l2Settings> live_cameras(const BoothConfig& config);
+
+/// "replay", "aravis" or "v4l2".
+std::string_view driver_name(const CameraConfig& camera);
 
 /// One thing wrong with a configuration: `path: value, expected …`.
 struct ConfigFault {
@@ -98,7 +151,7 @@ Result<BoothConfig> load_config(const std::filesystem::path& file);
 std::string write_config(const BoothConfig& config);
 
 /// Every key that the reader knows, dotted, in the order of the default file; members of an array of tables as
-/// "replay.faults[].kind".
+/// "replay.faults[].kind", those of cameras once for each driver.
 std::vector<std::string> config_keys();
 
 }  // namespace booth

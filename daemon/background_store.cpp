@@ -10,7 +10,6 @@
 
 #include "pipeline/types/rig.h"
 #include "replay/durable_folder.h"
-#include "replay/recording_writer.h"
 
 namespace booth {
 
@@ -49,10 +48,20 @@ Result<void> BackgroundStore::adopt(const Recording& recording, const std::strin
   const Shot* shot = recording.find(ShotRole::background);
   if (shot == nullptr)
     return Error{ErrorCode::no_background, recording.folder.string() + ": the recording has no background shot"};
-  auto writer = RecordingWriter::begin(folder_, {.id = id, .created = created, .label = {}, .face = {}}, recording.rig);
+  auto writer = begin(recording.rig, {}, id, created);
   if (!writer) return writer.error();
   if (const auto added = (*writer)->add_shot(recording, *shot); !added) return added;
-  if (const auto committed = (*writer)->commit(); !committed) return committed;
+  return finish(**writer, id);
+}
+
+Result<std::unique_ptr<RecordingWriter>> BackgroundStore::begin(const Rig& rig, const SpoolOptions& images,
+                                                                const std::string& id,
+                                                                const std::string& created) const {
+  return RecordingWriter::begin(folder_, {.id = id, .created = created, .label = {}, .face = {}}, rig, images);
+}
+
+Result<void> BackgroundStore::finish(RecordingWriter& writer, const std::string& id) {
+  if (const auto committed = writer.commit(); !committed) return committed;
   auto written = read_recording(folder_ / id);
   if (!written) return written.error();
 

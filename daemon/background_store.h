@@ -7,6 +7,7 @@
 
 #include "pipeline/types/result.h"
 #include "replay/recording.h"
+#include "replay/recording_writer.h"
 
 namespace booth {
 
@@ -24,6 +25,12 @@ class BackgroundStore {
   /// @param id  a new one, is_safe_id
   /// @error no_background  the recording has none; what RecordingWriter returns
   Result<void> adopt(const Recording& recording, const std::string& id, const std::string& created);
+
+  /// Begins to learn: the caller adds a background shot. @error what RecordingWriter returns
+  Result<std::unique_ptr<RecordingWriter>> begin(const Rig& rig, const SpoolOptions& images, const std::string& id,
+                                                 const std::string& created) const;
+  /// Takes what was written in place of what was learned before. @error what RecordingWriter returns
+  Result<void> finish(RecordingWriter& writer, const std::string& id);
 
  private:
   explicit BackgroundStore(std::filesystem::path folder) : folder_(std::move(folder)) {}

@@ -105,10 +105,12 @@ Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<D
 Booth::~Booth() {
   housekeeper_.request_stop();
   if (housekeeper_.joinable()) housekeeper_.join();
+  discoverer_.reset();
   eraser_.reset();
   runner_.reset();
   session_.reset();
   cameras_.reset();
+  previews_.reset();
   if (state_lock_ >= 0) ::close(state_lock_);
 }
 
@@ -146,12 +148,7 @@ Result<void> Booth::open_stores() {
 }
 
 void Booth::open_capture(const Devices& devices) {
-  if (!devices.rig) return;
-  calibration_.loaded = true;
-  calibration_.created = devices.rig_created;
-  for (const RigCamera& camera : devices.rig->cameras)
-    if (camera.rms_px) calibration_.rms_px = std::max(calibration_.rms_px.value_or(0), *camera.rms_px);
-
+  load_rig(devices);
   if (devices.replayed) {
     const auto now = std::chrono::system_clock::now();
     if (const auto adopted = backgrounds_->adopt(*devices.replayed, make_capture_id(now), devices.replayed->created);
@@ -159,18 +156,27 @@ void Booth::open_capture(const Devices& devices) {
       spdlog::error("the replayed recording gives no background: {}", adopted.error().message);
   }
 
-  std::vector<CameraInfo> cameras;
-  for (const RigCamera& camera : devices.rig->cameras)
-    cameras.push_back(
-        {camera.id, options_.config.drivers.camera, camera.role, camera.intrinsics.width, camera.intrinsics.height});
+  drivers_ = devices.drivers;
+  mount_rotations_ = devices.mount_rotations;
+  std::vector<CameraInfo> cameras = devices.cameras;
+  const auto rig = this->rig();
+  for (CameraInfo& camera : cameras)
+    if (const RigCamera* calibrated = rig ? rig->find(camera.id) : nullptr; calibrated != nullptr) {
+      camera.width = calibrated->intrinsics.width;
+      camera.height = calibrated->intrinsics.height;
+    }
   cameras_ = std::make_unique<CameraSupervisor>(cameras, devices.source, clock_, [this](const CameraStatus& camera) {
     events_.publish(CameraChanged{camera.id, camera.state, camera.message});
   });
+  previews_ = std::make_unique<PreviewBoard>(*cameras_, metrics_, clock_, events_.wakeup());
   session_ = std::make_unique<CaptureSession>(CaptureParts{.config = options_.config.capture,
                                                            .recordings = options_.config.booth.recordings(),
                                                            .source = devices.source,
-                                                           .rig = *devices.rig,
+                                                           .trigger = devices.trigger,
+                                                           .projector = devices.projector,
+                                                           .rig = [this] { return this->rig(); },
                                                            .cameras = *cameras_,
+                                                           .tasks = tasks_,
                                                            .backgrounds = *backgrounds_,
                                                            .jobs = *jobs_,
                                                            .events = events_,
@@ -178,6 +184,26 @@ void Booth::open_capture(const Devices& devices) {
                                                            .clock = clock_,
                                                            .set_state = [this](BoothState state) { set_state(state); },
                                                            .check_disk = [this] { return check_disk(); }});
+  constexpr size_t most_discoveries = 4;
+  discoverer_ = std::make_unique<SerialExecutor>("discover", most_discoveries);
+}
+
+void Booth::load_rig(const Devices& devices) {
+  const std::lock_guard lock(rig_mutex_);
+  rig_fault_ = devices.rig_fault;
+  calibration_ = {};
+  rig_.reset();
+  if (!devices.rig) return;
+  rig_ = std::make_shared<const Rig>(*devices.rig);
+  calibration_.loaded = true;
+  calibration_.created = devices.rig_created;
+  for (const RigCamera& camera : rig_->cameras)
+    if (camera.rms_px) calibration_.rms_px = std::max(calibration_.rms_px.value_or(0), *camera.rms_px);
+}
+
+std::shared_ptr<const Rig> Booth::rig() const {
+  const std::lock_guard lock(rig_mutex_);
+  return rig_;
 }
 
 /// The daemon may have died after a capture was on the disk and before its job was, or between the two deletions of an
@@ -234,11 +260,11 @@ std::vector<Reason> Booth::find_reasons(BoothState state) const {
   if (state == BoothState::stopping) reasons.push_back({"not_ready", "the booth is stopping"});
   if (state == BoothState::fault) reasons.push_back({"not_ready", "the booth has no devices: " + device_fault_});
   if (session_ != nullptr) {
-    if (const auto capture = session_->current()) reasons.push_back({"busy", "capture " + *capture + " is under way"});
+    if (const auto busy = session_->occupation()) reasons.push_back({"busy", *busy});
     if (const DeviceStatus trigger = session_->trigger(); trigger.state == DeviceState::offline)
       reasons.push_back({"camera_unavailable", "the trigger is offline: " + trigger.message});
   }
-  if (!calibration_.loaded) reasons.push_back({"not_calibrated", "the booth is not calibrated"});
+  find_calibration_reasons(reasons);
   if (cameras_ != nullptr) {
     int online = 0;
     std::string offline;
@@ -258,6 +284,109 @@ std::vector<Reason> Booth::find_reasons(BoothState state) const {
     reasons.push_back({"no_background", "the booth has not learned its background yet"});
   if (const auto disk = check_disk(); !disk) reasons.push_back({"disk_full", disk.error().message});
   return reasons;
+}
+
+void Booth::find_calibration_reasons(std::vector<Reason>& reasons) const {
+  std::shared_ptr<const Rig> rig;
+  std::string fault;
+  {
+    const std::lock_guard lock(rig_mutex_);
+    rig = rig_;
+    fault = rig_fault_;
+  }
+  if (rig == nullptr) {
+    reasons.push_back({"not_calibrated", "the booth is not calibrated" + (fault.empty() ? "" : ": " + fault)});
+    return;
+  }
+  if (cameras_ == nullptr) return;
+  std::string without, otherwise;
+  for (const CameraStatus& camera : cameras_->status()) {
+    const RigCamera* calibrated = rig->find(camera.id);
+    if (calibrated == nullptr)
+      without += (without.empty() ? "" : ", ") + camera.id;
+    else if (calibrated->role != camera.role)
+      otherwise += (otherwise.empty() ? "" : ", ") + camera.id;
+  }
+  if (!without.empty())
+    reasons.push_back({"not_calibrated", "the calibration does not know " + without +
+                                             ": calibrate the booth, or take them out of the configuration"});
+  if (!otherwise.empty())
+    reasons.push_back({"not_calibrated", "body and face cameras are not those that were calibrated: " + otherwise +
+                                             " has another role now"});
+}
+
+/// @param tolerated  kinds of reasons that do not matter now. @error the first of the others
+Result<void> Booth::check_ready(const std::vector<std::string>& tolerated) const {
+  BoothState state{};
+  {
+    const std::lock_guard lock(state_mutex_);
+    state = state_;
+  }
+  for (const Reason& reason : find_reasons(state))
+    if (std::find(tolerated.begin(), tolerated.end(), reason.kind) == tolerated.end())
+      return Error{code_of(reason.kind), reason.message};
+  return {};
+}
+
+Result<std::string> Booth::discover_cameras() {
+  if (discoverer_ == nullptr) return Error{ErrorCode::not_ready, "the booth has no devices: " + device_fault_};
+  const std::string task = tasks_.begin(TaskKind::discover);
+  const bool taken = discoverer_->post([this, task] {
+    try {
+      tasks_.finish(task, TaskResult(look_for_cameras()));
+    } catch (const std::exception& fault) {
+      tasks_.finish(task, Error{ErrorCode::internal, "a driver has a fault: " + std::string(fault.what())});
+    }
+  });
+  if (taken) return task;
+  const Error busy{ErrorCode::busy, "the booth is looking for cameras already; try again in a moment"};
+  tasks_.finish(task, busy);
+  return busy;
+}
+
+CamerasDiscovered Booth::look_for_cameras() const {
+  CamerasDiscovered found;
+  for (const Driver& driver : drivers_) {
+    const auto seen = driver.source->discover();
+    if (!seen) {
+      found.faults.push_back(driver.name + ": " + seen.error().message);
+      continue;
+    }
+    for (const CameraInfo& camera : *seen) found.cameras.push_back({camera, cameras_->has(camera.id)});
+  }
+  return found;
+}
+
+Result<std::string> Booth::learn_background(std::optional<int> frames) {
+  if (const auto ready = check_ready({"no_background"}); !ready) return ready.error();
+  return session_->learn_background({frames.value_or(options_.config.capture.background_frames)});
+}
+
+Result<std::string> Booth::test_trigger() {
+  if (session_ == nullptr) return Error{ErrorCode::not_ready, "the booth has no devices: " + device_fault_};
+  return session_->test_trigger();
+}
+
+Result<void> Booth::start_preview(const std::string& camera, PreviewSettings settings) {
+  if (cameras_ == nullptr || !cameras_->has(camera)) return Error{ErrorCode::not_found, "there is no camera " + camera};
+  const auto rig = this->rig();
+  if (const RigCamera* calibrated = rig ? rig->find(camera) : nullptr; calibrated != nullptr)
+    settings.rotation_deg = calibrated->mount_rotation_deg;
+  else if (const auto configured = mount_rotations_.find(camera); configured != mount_rotations_.end())
+    settings.rotation_deg = configured->second;
+  previews_->start(camera, settings);
+  return {};
+}
+
+Result<void> Booth::stop_preview(const std::string& camera) {
+  if (cameras_ == nullptr || !cameras_->has(camera)) return Error{ErrorCode::not_found, "there is no camera " + camera};
+  previews_->stop(camera);
+  return {};
+}
+
+std::vector<PreviewPicture> Booth::take_previews() {
+  if (previews_ == nullptr) return {};
+  return previews_->take();
 }
 
 Result<void> Booth::check_disk() const {
@@ -321,11 +450,14 @@ BoothStatus Booth::status() const {
   if (session_ != nullptr) {
     status.capture = session_->current();
     status.trigger = session_->trigger();
-    status.trigger->name = options_.config.drivers.camera;
     status.projector = session_->projector();
   }
   if (cameras_ != nullptr) status.cameras = cameras_->status();
-  status.calibration = calibration_;
+  {
+    const std::lock_guard lock(rig_mutex_);
+    status.calibration = calibration_;
+  }
+  status.tasks = tasks_.list();
   if (const auto background = backgrounds_->current()) status.background = {true, background->created};
   for (Job& job : jobs_->list())
     if (job.state != JobState::done) status.queue.push_back(std::move(job));
@@ -349,6 +481,8 @@ std::map<std::string, double> Booth::measurements() const {
     for (const CameraStatus& camera : cameras_->status()) {
       values["camera_" + camera.id + "_frames"] = static_cast<double>(camera.frames);
       values["camera_" + camera.id + "_dropped"] = static_cast<double>(camera.dropped);
+      for (const Statistic& statistic : camera.statistics)
+        values["camera_" + camera.id + "_" + statistic.name] = statistic.value;
     }
   return values;
 }
@@ -357,13 +491,9 @@ Result<std::string> Booth::start_capture(const CaptureRequest& request) {
   if (session_ != nullptr && session_->current() == std::nullopt && request.face == FaceMode::active &&
       !session_->projector())
     return Error{ErrorCode::unsupported, "this booth has no projector: choose the face mode passive or none"};
-  BoothState state{};
-  {
-    const std::lock_guard lock(state_mutex_);
-    state = state_;
-  }
-  if (const auto reasons = find_reasons(state); !reasons.empty())
-    return Error{code_of(reasons.front().kind), reasons.front().message};
+  if (const auto ready = check_ready({}); !ready) return ready.error();
+  if (request.face == FaceMode::active && !rig()->projector)
+    return Error{ErrorCode::not_calibrated, "the projector is not calibrated: choose the face mode passive or none"};
   if (request.face == FaceMode::active && session_->projector()->state == DeviceState::offline)
     return Error{ErrorCode::device_lost, "the projector is offline: " + session_->projector()->message};
   return session_->start(request);

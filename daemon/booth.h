@@ -22,19 +22,33 @@
 #include "daemon/job_queue.h"
 #include "daemon/job_runner.h"
 #include "daemon/metrics.h"
+#include "daemon/preview_board.h"
 #include "daemon/serial_executor.h"
+#include "daemon/task_board.h"
 #include "drivers/clock.h"
 #include "drivers/device_source.h"
 #include "replay/recording.h"
 
 namespace booth {
 
+/// A driver by its name.
+struct Driver {
+  std::string name;
+  std::shared_ptr<DeviceSource> source;
+};
+
 /// The devices that the configuration names, and the rig that they belong to.
 struct Devices {
   std::shared_ptr<DeviceSource> source;
-  std::optional<Rig> rig;
-  std::string rig_created;            ///< ISO 8601, UTC; may be empty
-  std::optional<Recording> replayed;  ///< whose background is the booth's, where the devices are played back
+  std::vector<Driver> drivers;                 ///< where camera.discover looks
+  std::vector<CameraInfo> cameras;             ///< id, driver and role of each
+  std::map<std::string, int> mount_rotations;  ///< by camera, as configured: for those that the rig does not have
+  std::string trigger;                         ///< its driver's name
+  std::optional<std::string> projector;        ///< its id
+  std::optional<Rig> rig;                      ///< nothing: the booth is not calibrated
+  std::string rig_fault;                       ///< why there is none, where one was there but cannot be used
+  std::string rig_created;                     ///< ISO 8601, UTC; may be empty
+  std::optional<Recording> replayed;           ///< whose background is the booth's, where the devices are played back
 };
 
 /// @error as the driver's; unsupported  no driver of that name
@@ -72,7 +86,8 @@ struct BoothStatus {
   std::optional<DeviceStatus> projector, trigger;
   CalibrationStatus calibration;
   BackgroundStatus background;
-  std::vector<Job> queue;  ///< not done
+  std::vector<Task> tasks;  ///< under way
+  std::vector<Job> queue;   ///< not done
   DiskStatus disk;
   double uptime_s = 0;
 };
@@ -100,6 +115,24 @@ class Booth {
   BoothStatus status() const;
   std::map<std::string, double> measurements() const;
 
+  // Tasks: each returns its id at once, and `task` events tell how it goes.
+  /// Every camera that the drivers see. @error busy, not_ready
+  Result<std::string> discover_cameras();
+  /// @param frames  of each camera, 1 … 100; nothing: as configured. @error busy, not_ready, not_calibrated,
+  /// device_lost
+  Result<std::string> learn_background(std::optional<int> frames);
+  /// Fires once and tells which cameras answer, and when. @error busy, not_ready, device_lost
+  Result<std::string> test_trigger();
+
+  /// @param settings  its rotation is the camera's own. @error not_found  no such camera
+  Result<void> start_preview(const std::string& camera, PreviewSettings settings);
+  Result<void> stop_preview(const std::string& camera);
+  /// What previews show now; events().wakeup() tells when there is something.
+  std::vector<PreviewPicture> take_previews();
+
+  /// The current calibration; null while there is none.
+  std::shared_ptr<const Rig> rig() const;
+
   /// @error busy, unsupported, not_ready, not_calibrated, no_background, disk_full, device_lost
   Result<std::string> start_capture(const CaptureRequest& request);
   Result<void> cancel_capture(const std::string& capture);
@@ -125,7 +158,11 @@ class Booth {
   void adopt_orphans();
   void set_state(BoothState state);
   void refresh();
+  CamerasDiscovered look_for_cameras() const;
+  void load_rig(const Devices& devices);
   std::vector<Reason> find_reasons(BoothState state) const;
+  void find_calibration_reasons(std::vector<Reason>& reasons) const;
+  Result<void> check_ready(const std::vector<std::string>& tolerated) const;
   Result<void> check_disk() const;
   void measure_disk();
   void keep_house(const std::stop_token& stop);
@@ -141,12 +178,20 @@ class Booth {
   std::unique_ptr<AvatarStore> avatars_;
   SerialExecutor disk_executor_;  ///< its tasks use the two above
   std::unique_ptr<BackgroundStore> backgrounds_;
-  CalibrationStatus calibration_;
+  TaskBoard tasks_{events_};
+  mutable std::mutex rig_mutex_;
+  std::shared_ptr<const Rig> rig_;  ///< guarded by rig_mutex_
+  CalibrationStatus calibration_;   ///< guarded by rig_mutex_
+  std::string rig_fault_;           ///< guarded by rig_mutex_
+  std::map<std::string, int> mount_rotations_;
   std::string device_fault_;  ///< why there are no devices; empty when there are
+  std::vector<Driver> drivers_;
+  std::unique_ptr<PreviewBoard> previews_;  ///< the cameras' threads use it
   std::unique_ptr<CameraSupervisor> cameras_;
   std::unique_ptr<CaptureSession> session_;
   std::unique_ptr<JobRunner> runner_;
   std::unique_ptr<Eraser> eraser_;
+  std::unique_ptr<SerialExecutor> discoverer_;  ///< looking for cameras takes seconds
 
   std::atomic<uint64_t> free_bytes_{0}, used_bytes_{0};
   mutable std::mutex state_mutex_;

@@ -11,6 +11,7 @@
 #include <fstream>
 #include <iostream>
 #include <nlohmann/json.hpp>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -119,6 +120,8 @@ class Operator {
   void list_avatars(size_t limit);
   void fetch(const std::string& avatar, std::vector<std::string> files, const fs::path& folder);
   void watch();
+  void task(const std::string& method, const Json& params);
+  void preview(const std::string& camera, int max_width, const fs::path& file);
 
  private:
   api::CallReply call(const std::string& method, const Json& params);
@@ -323,6 +326,52 @@ void Operator::fetch_file(const std::string& avatar, const std::string& file, co
     throw Failure{exit_refused, written.error().message};
 }
 
+/// Starts a task, waits for its end and shows its result.
+void Operator::task(const std::string& method, const Json& params) {
+  constexpr std::chrono::milliseconds patience{1000};
+  client_.subscribe();
+  const std::string task = call_with_key(method, params).at("task").get<std::string>();
+  ProgressLine line(options_.json);
+  int checks_without = 0;
+  for (;;) {
+    const auto event = client_.next_event(patience);
+    if (event && event->topic == "task" && event->fields.value("task", std::string()) == task) {
+      const Json& fields = event->fields;
+      const std::string state = fields.value("state", std::string());
+      line.draw(text_of(fields, "kind"), fields.value("fraction", 0.0));
+      if (state == "running") continue;
+      line.clear();
+      if (state != "done")
+        throw Failure{exit_refused,
+                      text_of(fields.at("error"), "message") + " (" + text_of(fields.at("error"), "kind") + ")"};
+      std::cout << fields.at("result").dump(2) << "\n";
+      return;
+    }
+    if (event) continue;
+    // Its last event may have been lost.
+    const Json tasks = call("system.status", Json::object()).result.at("tasks");
+    const bool runs = std::any_of(tasks.begin(), tasks.end(), [&](const Json& t) { return t.at("task") == task; });
+    if (!runs && ++checks_without > 1) throw Failure{exit_refused, "task " + task + " is over; its result was lost"};
+  }
+}
+
+void Operator::preview(const std::string& camera, int max_width, const fs::path& file) {
+  const auto patience = std::chrono::milliseconds(static_cast<int64_t>(1000 * options_.timeout_s));
+  client_.subscribe();
+  call_with_key("preview.start", {{"camera", camera}, {"fps", 10}, {"max_width", max_width}});
+  std::optional<api::ReceivedEvent> picture;
+  const auto deadline = SteadyClock::now() + patience;
+  while (!picture && SteadyClock::now() < deadline) {
+    auto event = client_.next_event(std::chrono::milliseconds(200));
+    if (event && event->topic == "preview." + camera) picture = std::move(event);
+  }
+  call_with_key("preview.stop", {{"camera", camera}});
+  if (!picture) throw Failure{exit_refused, camera + ": showed nothing; see boothctl status"};
+  if (const auto written = write_file_atomically(file, picture->bytes); !written)
+    throw Failure{exit_refused, written.error().message};
+  if (options_.json) std::cout << picture->fields.dump(2) << "\n";
+}
+
 void Operator::watch() {
   constexpr std::chrono::milliseconds silence{3500};  // three heartbeats
   client_.subscribe();
@@ -420,6 +469,31 @@ int main(int argc, char** argv) {
   changing(avatars, "delete", "delete an avatar, its recording and every trace of the person", "avatar.delete",
            "avatar");
 
+  app.add_subcommand("discover", "every camera that the drivers can see, configured or not")->callback([&] {
+    action = [](booth::Operator& op) { op.task("camera.discover", Json::object()); };
+  });
+  std::string file;
+  int max_width = 1024;
+  auto* preview = app.add_subcommand("preview", "what a camera sees now, as a JPEG file");
+  preview->add_option("CAMERA", id)->required();
+  preview->add_option("--to", file, "the file")->required();
+  preview->add_option("--max-width", max_width, "pixels")->check(CLI::Range(1, 65536))->capture_default_str();
+  preview->callback([&] { action = [&](booth::Operator& op) { op.preview(id, max_width, file); }; });
+  auto* background = app.add_subcommand("background", "the empty booth");
+  background->require_subcommand(1);
+  std::optional<int> frames;
+  auto* learn = background->add_subcommand("learn", "learn it: nobody may be in the booth");
+  learn->add_option("--frames", frames, "pictures of each camera")->check(CLI::Range(1, 100));
+  learn->callback([&] {
+    action = [&](booth::Operator& op) {
+      op.task("background.learn", frames ? Json{{"frames", *frames}} : Json::object());
+    };
+  });
+  auto* trigger = app.add_subcommand("trigger", "what makes the cameras expose");
+  trigger->require_subcommand(1);
+  trigger->add_subcommand("test", "fire once; tells which cameras answer, and when")->callback([&] {
+    action = [](booth::Operator& op) { op.task("trigger.test", Json::object()); };
+  });
   app.add_subcommand("watch", "what happens, as it happens")->callback([&] {
     action = [](booth::Operator& op) { op.watch(); };
   });

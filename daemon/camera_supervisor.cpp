@@ -8,14 +8,24 @@
 #include <stdexcept>
 #include <utility>
 
+#include "daemon/device_slot.h"
+
 namespace booth {
 namespace {
 
+using SteadyClock = std::chrono::steady_clock;
+
 constexpr std::chrono::milliseconds first_patience{250};  ///< before a lost camera is opened again
 constexpr std::chrono::milliseconds most_patience{5000};
+constexpr std::chrono::milliseconds permanent_patience{
+    30'000};                                          ///< somebody may have changed the camera's own settings
+constexpr std::chrono::milliseconds idle_pause{500};  ///< between two looks whether it is still there
 constexpr Timestamp frame_slice = milliseconds(100);  ///< how long one wait for a frame lasts
+constexpr Timestamp test_patience = seconds(3);       ///< for the test frame
 
 double age_s(Timestamp then, Timestamp now) { return static_cast<double>(now - then) / 1e9; }
+
+std::string size_text(int width, int height) { return std::to_string(width) + " × " + std::to_string(height); }
 
 }  // namespace
 
@@ -45,6 +55,7 @@ void SupervisedCamera::arm(const CaptureSettings& settings, int count, std::shar
     const std::lock_guard lock(mutex_);
     order_ = Order{settings, count, std::move(inbox)};
     ++order_number_;
+    if (device_ && preview_) device_->stop();  // so that nobody waits for the preview's next frame
   }
   wake_.notify_all();
 }
@@ -54,6 +65,20 @@ void SupervisedCamera::disarm() noexcept {
   order_.reset();
   ++order_number_;
   if (device_) device_->stop();
+}
+
+void SupervisedCamera::note_trigger(int index, Timestamp when) noexcept {
+  const std::lock_guard lock(mutex_);
+  if (device_) device_->note_trigger(index, when);
+}
+
+void SupervisedCamera::set_preview(PreviewSink sink) {
+  {
+    const std::lock_guard lock(mutex_);
+    preview_ = std::move(sink);
+    ++order_number_;
+  }
+  wake_.notify_all();
 }
 
 bool SupervisedCamera::is_current(uint64_t number) const {
@@ -70,12 +95,13 @@ void SupervisedCamera::note_missing(const std::string& message) {
   set_state(DeviceState::degraded, message);
 }
 
-void SupervisedCamera::set_state(DeviceState state, const std::string& message) {
+void SupervisedCamera::set_state(DeviceState state, const std::string& message, bool permanent) {
   {
     const std::lock_guard lock(mutex_);
     if (status_.state == state && status_.message == message) return;
     status_.state = state;
     status_.message = message;
+    status_.permanent = permanent;
   }
   if (state == DeviceState::online)
     spdlog::info("camera {}: online", info_.id);
@@ -85,44 +111,110 @@ void SupervisedCamera::set_state(DeviceState state, const std::string& message) 
 }
 
 void SupervisedCamera::run(const std::stop_token& stop) {
-  constexpr std::chrono::milliseconds idle{1000};
-  std::chrono::milliseconds patience = first_patience;
   while (!stop.stop_requested()) {
     try {
-      const bool opened = device_ != nullptr || open();
-      std::optional<Order> order;
-      uint64_t number = 0;
-      {
-        std::unique_lock lock(mutex_);
-        wake_.wait_for(lock, stop, opened ? idle : patience, [this] { return order_.has_value(); });
-        order = std::exchange(order_, std::nullopt);
-        number = order_number_;
-      }
-      patience = opened ? first_patience : std::min(2 * patience, most_patience);
-      if (!order || stop.stop_requested()) continue;
-      // Somebody wants a picture now: that is worth another try at once.
-      if (device_ != nullptr || open())
-        serve(*order, number, stop);
-      else
-        order->inbox->try_push({CameraNews::Kind::fault, info_.id, {}, {ErrorCode::device_lost, status().message}});
+      tend(stop);
     } catch (const std::exception& fault) {
       lose({ErrorCode::internal, "the driver has a fault: " + std::string(fault.what())});
     }
   }
 }
 
-bool SupervisedCamera::open() {
+/// One round of the camera's thread: opens the camera where it is time to, carries out what is asked, or waits a while.
+void SupervisedCamera::tend(const std::stop_token& stop) {
+  if (device_ == nullptr && SteadyClock::now() >= next_try_ && !open(stop)) {
+    const bool permanent = status().permanent;
+    patience_ = permanent                ? permanent_patience
+                : patience_.count() == 0 ? first_patience
+                                         : std::min(2 * patience_, most_patience);
+    next_try_ = SteadyClock::now() + patience_;
+  }
+  std::optional<Order> order;
+  PreviewSink preview;
+  uint64_t number = 0;
+  {
+    std::unique_lock lock(mutex_);
+    const auto until = device_ ? SteadyClock::now() + idle_pause : next_try_;
+    wake_.wait_until(lock, stop, until, [this] { return order_.has_value() || (device_ && preview_); });
+    order = std::exchange(order_, std::nullopt);
+    preview = preview_;
+    number = order_number_;
+  }
+  if (stop.stop_requested()) return;
+  if (order && device_ == nullptr) {
+    order->inbox->try_push({CameraNews::Kind::fault, info_.id, {}, {ErrorCode::device_lost, status().message}});
+  } else if (order) {
+    serve(*order, number, stop);
+  } else if (device_ && preview) {
+    show(preview, number, stop);
+  } else if (device_) {
+    if (const auto present = device_->check_presence(); !present) lose(present.error());
+  }
+  read_statistics();
+}
+
+bool SupervisedCamera::open(const std::stop_token& stop) {
   auto opened = source_->open_camera(info_.id);
   if (!opened) {
-    set_state(DeviceState::offline, opened.error().message);
+    set_state(DeviceState::offline, opened.error().message, is_permanent(opened.error().code));
     return false;
   }
   {
     const std::lock_guard lock(mutex_);
     device_ = std::move(*opened);
   }
+  if (const auto tested = take_test_frame(stop); !tested) {
+    lose(tested.error());
+    return false;
+  }
+  patience_ = std::chrono::milliseconds(0);
   set_state(DeviceState::online, "");
   return true;
+}
+
+/// A camera that opens may still be of no use: only one that shows a picture of the right size is online.
+Result<void> SupervisedCamera::take_test_frame(const std::stop_token& stop) {
+  const auto armed = device_->arm({.role = ShotRole::body, .mode = CaptureMode::preview}, 1);
+  // A camera that cannot show pictures without a trigger is believed.
+  if (!armed) return armed.error().code == ErrorCode::unsupported ? Result<void>{} : armed;
+  const Timestamp deadline = clock_.now() + test_patience;
+  std::string last_fault = "nothing came";
+  while (!stop.stop_requested()) {
+    const Timestamp now = clock_.now();
+    if (now >= deadline) {
+      device_->stop();
+      return Error{ErrorCode::timeout, "it can be opened, but gave no test frame within " +
+                                           std::to_string(test_patience / seconds(1)) + " s: " + last_fault};
+    }
+    const auto frame = device_->wait_frame(std::min(deadline, now + frame_slice));
+    if (frame) {
+      device_->stop();
+      const int width = frame->pixels->width, height = frame->pixels->height;
+      if (info_.width > 0 && (width != info_.width || height != info_.height))
+        return Error{ErrorCode::invalid_argument,
+                     "it delivers " + size_text(width, height) + " pixels, but was calibrated with " +
+                         size_text(info_.width, info_.height) + ": set its region, or calibrate it again"};
+      const std::lock_guard lock(mutex_);
+      last_frame_ = clock_.now();
+      return {};
+    }
+    const Error& error = frame.error();
+    if (error.code == ErrorCode::timeout) continue;
+    last_fault = error.message;
+    if (error.code == ErrorCode::invalid_file) continue;
+    // Somebody called disarm(), which stops the camera: the test goes on.
+    if (error.code != ErrorCode::cancelled) return error;
+    if (const auto again = device_->arm({.role = ShotRole::body, .mode = CaptureMode::preview}, 1); !again)
+      return again;
+  }
+  return Error{ErrorCode::cancelled, "the booth is stopping"};
+}
+
+void SupervisedCamera::read_statistics() {
+  if (device_ == nullptr) return;
+  std::vector<Statistic> statistics = device_->statistics();
+  const std::lock_guard lock(mutex_);
+  status_.statistics = std::move(statistics);
 }
 
 void SupervisedCamera::lose(const Error& error) {
@@ -132,7 +224,32 @@ void SupervisedCamera::lose(const Error& error) {
     lost = std::move(device_);
   }
   lost.reset();  // may take its time, so not under the lock
-  set_state(DeviceState::offline, error.message);
+  set_state(DeviceState::offline, error.message, is_permanent(error.code));
+}
+
+void SupervisedCamera::show(const PreviewSink& sink, uint64_t number, const std::stop_token& stop) {
+  if (const auto armed = device_->arm({.role = ShotRole::body, .mode = CaptureMode::preview}, 1); !armed) {
+    if (armed.error().code == ErrorCode::device_lost) return lose(armed.error());
+    spdlog::warn("camera {}: has no preview: {}", info_.id, armed.error().message);
+    const std::lock_guard lock(mutex_);
+    if (order_number_ == number) preview_ = nullptr;
+    return;
+  }
+  while (!stop.stop_requested() && is_current(number)) {
+    const auto frame = device_->wait_frame(clock_.now() + frame_slice);
+    if (frame) {
+      {
+        const std::lock_guard lock(mutex_);
+        last_frame_ = clock_.now();
+      }
+      sink(*frame);
+      continue;
+    }
+    const ErrorCode code = frame.error().code;
+    if (code == ErrorCode::cancelled) break;
+    if (code != ErrorCode::timeout && code != ErrorCode::invalid_file) return lose(frame.error());
+  }
+  device_->stop();
 }
 
 void SupervisedCamera::serve(const Order& order, uint64_t number, const std::stop_token& stop) {
@@ -197,6 +314,10 @@ std::vector<std::string> CameraSupervisor::ids(CameraRole role) const {
   for (const auto& camera : cameras_)
     if (camera->status().role == role) found.push_back(camera->id());
   return found;
+}
+
+bool CameraSupervisor::has(const std::string& id) const {
+  return std::any_of(cameras_.begin(), cameras_.end(), [&](const auto& camera) { return camera->id() == id; });
 }
 
 SupervisedCamera& CameraSupervisor::camera(const std::string& id) {

@@ -12,6 +12,7 @@
 
 #include "daemon/identifier.h"
 #include "replay/durable_folder.h"
+#include "replay/recording_file.h"
 
 namespace booth {
 namespace {
@@ -21,10 +22,15 @@ constexpr Timestamp arm_before_zero = seconds(1);  ///< so that the picture is t
 constexpr std::chrono::milliseconds countdown_slice{100};
 constexpr std::chrono::milliseconds device_pause{1000};  ///< between two tries to open the trigger or the projector
 constexpr size_t remembered_failures = 256;
+constexpr int background_repeats = 3;                       ///< triggers in place of those that somebody missed
+constexpr std::chrono::milliseconds background_pause{100};  ///< between two of its frames, so that motion is seen
+constexpr double moved_share = 0.01;    ///< of a picture's cells, that change only when something moves
+constexpr double altered_share = 0.03;  ///< of a picture's cells, that say that the booth is not what it was
 /// A pattern that a camera missed is shown once more while the subject is still there; this many times in a sequence,
 /// lest a bad cable keep somebody standing.
 constexpr int most_repeats = 8;
 
+constexpr const char* background_shot = "background";
 constexpr const char* body_shot = "body";
 constexpr const char* face_shot = "face";
 
@@ -42,10 +48,10 @@ double elapsed_s(Timestamp from, Timestamp to) { return static_cast<double>(to -
 
 CaptureSession::CaptureSession(CaptureParts parts)
     : parts_(std::move(parts)),
-      trigger_("trigger", [source = parts_.source] { return source->open_trigger(); }),
+      trigger_(parts_.trigger, [source = parts_.source] { return source->open_trigger(); }),
       encoders_(0) {
-  if (parts_.rig.projector)
-    projector_.emplace(parts_.rig.projector->id, [source = parts_.source] { return source->open_projector(); });
+  if (parts_.projector)
+    projector_.emplace(*parts_.projector, [source = parts_.source] { return source->open_projector(); });
   tend_devices();
   thread_ = std::jthread([this](const std::stop_token& stop) { run(stop); });
   pthread_setname_np(thread_.native_handle(), "capture");
@@ -63,37 +69,71 @@ std::optional<DeviceStatus> CaptureSession::projector() const {
 
 std::optional<std::string> CaptureSession::current() const {
   const std::lock_guard lock(mutex_);
-  if (!capture_) return std::nullopt;
-  return capture_->id;
+  if (!operation_ || !operation_->is_capture()) return std::nullopt;
+  return operation_->id;
+}
+
+std::optional<std::string> CaptureSession::occupation() const {
+  const std::lock_guard lock(mutex_);
+  if (!operation_) return std::nullopt;
+  if (std::holds_alternative<BackgroundRequest>(operation_->request)) return "the background is being learned";
+  if (std::holds_alternative<TriggerTestRequest>(operation_->request)) return "the trigger is being tested";
+  return "capture " + operation_->id + " is under way";
 }
 
 Result<std::string> CaptureSession::start(const CaptureRequest& request) {
   if (request.face == FaceMode::active && !projector_)
     return Error{ErrorCode::unsupported, "this booth has no projector: choose the face mode passive or none"};
   const std::string id = make_capture_id(std::chrono::system_clock::now());
+  const auto begun = begin(id, request, request.countdown_s > 0 ? BoothState::countdown : BoothState::capturing);
+  if (!begun) return begun.error();
+  return id;
+}
+
+Result<std::string> CaptureSession::learn_background(const BackgroundRequest& request) {
+  if (parts_.rig() == nullptr)
+    return Error{ErrorCode::not_calibrated,
+                 "the booth is not calibrated: calibrate it before its background is learned"};
+  return begin_task(TaskKind::background, request, BoothState::learning_background);
+}
+
+Result<std::string> CaptureSession::test_trigger() {
+  return begin_task(TaskKind::trigger_test, TriggerTestRequest{}, BoothState::calibrating);
+}
+
+Result<std::string> CaptureSession::begin_task(TaskKind kind, const Request& request, BoothState state) {
+  if (const auto busy = occupation()) return Error{ErrorCode::busy, *busy};
+  const std::string task = parts_.tasks.begin(kind);
+  const auto begun = begin(task, request, state);
+  if (begun) return task;
+  parts_.tasks.finish(task, begun.error());
+  return begun.error();
+}
+
+Result<void> CaptureSession::begin(const std::string& id, const Request& request, BoothState state) {
   const std::lock_guard transition(transition_mutex_);
+  if (const auto busy = occupation()) return Error{ErrorCode::busy, *busy};
   {
     const std::lock_guard lock(mutex_);
     if (draining_) return Error{ErrorCode::not_ready, "the booth is stopping"};
-    if (capture_) return Error{ErrorCode::busy, "capture " + capture_->id + " is under way"};
-    capture_ = Capture{.id = id, .request = request, .stop = {}};
+    operation_ = Operation{.id = id, .request = request, .stop = {}};
   }
   // Before the thread may see it: the states that it sets come after this one.
-  parts_.set_state(request.countdown_s > 0 ? BoothState::countdown : BoothState::capturing);
+  parts_.set_state(state);
   {
     const std::lock_guard lock(mutex_);
     pending_ = true;
   }
   changed_.notify_all();
-  return id;
+  return {};
 }
 
 Result<void> CaptureSession::cancel(const std::string& id) {
   const std::lock_guard lock(mutex_);
   const Error over{ErrorCode::invalid_state, "capture " + id + " is over"};
-  if (capture_ && capture_->id == id) {
-    if (capture_->committing) return over;
-    capture_->stop.request_stop();
+  if (operation_ && operation_->id == id && operation_->is_capture()) {
+    if (operation_->committing) return over;
+    operation_->stop.request_stop();
     return {};
   }
   if (parts_.jobs.find(id) || std::find(over_.begin(), over_.end(), id) != over_.end()) return over;
@@ -103,54 +143,48 @@ Result<void> CaptureSession::cancel(const std::string& id) {
 void CaptureSession::abandon(const std::string& id) {
   const std::lock_guard lock(mutex_);
   over_.erase(std::remove(over_.begin(), over_.end(), id), over_.end());
-  if (!capture_ || capture_->id != id) return;
-  capture_->abandoned = true;
-  capture_->stop.request_stop();
+  if (!operation_ || operation_->id != id) return;
+  operation_->abandoned = true;
+  operation_->stop.request_stop();
 }
 
 void CaptureSession::wait_over(const std::string& id) {
   std::unique_lock lock(mutex_);
-  changed_.wait(lock, [&] { return !capture_ || capture_->id != id; });
+  changed_.wait(lock, [&] { return !operation_ || operation_->id != id; });
 }
 
 void CaptureSession::drain(std::chrono::milliseconds patience) {
   std::unique_lock lock(mutex_);
   draining_ = true;
-  if (capture_ && capture_->counting_down) capture_->stop.request_stop();
-  if (changed_.wait_for(lock, patience, [this] { return !capture_; })) return;
-  capture_->stop.request_stop();
-  changed_.wait(lock, [this] { return !capture_; });
+  if (operation_ && operation_->stoppable) operation_->stop.request_stop();
+  if (changed_.wait_for(lock, patience, [this] { return !operation_; })) return;
+  operation_->stop.request_stop();
+  changed_.wait(lock, [this] { return !operation_; });
 }
 
 bool CaptureSession::begin_commit(const std::string& id) {
   const std::lock_guard lock(mutex_);
-  if (!capture_ || capture_->id != id || capture_->stop.stop_requested()) return false;
-  return capture_->committing = true;
+  if (!operation_ || operation_->id != id || operation_->stop.stop_requested()) return false;
+  return operation_->committing = true;
 }
 
 void CaptureSession::run(const std::stop_token& stop) {
-  auto tended = std::chrono::steady_clock::now();
   while (!stop.stop_requested()) {
     pulse_.beat();
-    std::string id;
-    CaptureRequest request;
-    std::stop_token cancelled;
+    std::optional<Operation> operation;
     {
       std::unique_lock lock(mutex_);
       if (changed_.wait_for(lock, stop, device_pause, [this] { return pending_; })) {
         pending_ = false;
-        id = capture_->id;
-        request = capture_->request;
-        cancelled = capture_->stop.get_token();
+        operation = operation_;
       }
     }
     try {
-      if (!id.empty()) {
-        carry_out(id, request, cancelled);
-      } else if (std::chrono::steady_clock::now() - tended >= device_pause) {
+      if (operation)
+        std::visit([&](const auto& request) { carry_out(operation->id, request, operation->stop.get_token()); },
+                   operation->request);
+      else
         tend_devices();
-        tended = std::chrono::steady_clock::now();
-      }
     } catch (const std::exception& fault) {
       spdlog::error("the capture thread: {}", fault.what());
     }
@@ -159,8 +193,34 @@ void CaptureSession::run(const std::stop_token& stop) {
 
 void CaptureSession::tend_devices() {
   // What opening returns is in the slots' status.
-  static_cast<void>(trigger_.get());
-  if (projector_) static_cast<void>(projector_->get());
+  const auto now = std::chrono::steady_clock::now();
+  trigger_.tend(now);
+  if (projector_) projector_->tend(now);
+}
+
+template <class TaskRequest>
+void CaptureSession::carry_out(const std::string& id, const TaskRequest& request, const std::stop_token& cancelled) {
+  Result<TaskResult> result = was_cancelled();
+  try {
+    result = work(id, request, cancelled);
+  } catch (const std::exception& fault) {
+    result = Error{ErrorCode::internal, "the booth's program has a fault: " + std::string(fault.what())};
+  }
+  end_operation(false);
+  parts_.tasks.finish(id, result);
+}
+
+/// @param failed  it was a capture, of which somebody may still ask what became of it
+void CaptureSession::end_operation(bool failed) {
+  const std::lock_guard transition(transition_mutex_);
+  {
+    const std::lock_guard lock(mutex_);
+    if (failed && !operation_->abandoned) over_.push_back(operation_->id);
+    if (over_.size() > remembered_failures) over_.pop_front();
+    operation_.reset();
+  }
+  changed_.notify_all();
+  parts_.set_state(BoothState::idle);
 }
 
 void CaptureSession::carry_out(const std::string& id, const CaptureRequest& request, const std::stop_token& cancelled) {
@@ -197,7 +257,7 @@ bool CaptureSession::conclude(const std::string& id, const CaptureRequest& reque
   bool stays = taken;
   if (taken) {
     const std::lock_guard lock(mutex_);
-    stays = !capture_->abandoned;
+    stays = !operation_->abandoned;
     // From here on whoever deletes it finds the job.
     if (stays) parts_.jobs.add({.id = id, .face = std::string(to_string(request.face)), .label = request.label});
   }
@@ -206,21 +266,15 @@ bool CaptureSession::conclude(const std::string& id, const CaptureRequest& reque
     if (const auto removed = remove_folder(parts_.recordings, id); !removed)
       spdlog::error("capture {}: {}", id, removed.error().message);
   }
-  const std::lock_guard transition(transition_mutex_);
-  {
-    const std::lock_guard lock(mutex_);
-    if (!stays && !capture_->abandoned) over_.push_back(id);
-    if (over_.size() > remembered_failures) over_.pop_front();
-    capture_.reset();
-  }
-  changed_.notify_all();
-  parts_.set_state(BoothState::idle);
+  end_operation(!stays);
   return stays;
 }
 
 Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& request,
                                   const std::stop_token& cancelled) {
   if (const auto room = parts_.check_disk(); !room) return room;
+  const auto rig = parts_.rig();
+  if (rig == nullptr) return Error{ErrorCode::not_calibrated, "the booth is not calibrated"};
   const auto background = parts_.backgrounds.current();
   if (background == nullptr) return Error{ErrorCode::no_background, "the booth has not learned its background yet"};
   auto writer = RecordingWriter::begin(parts_.recordings,
@@ -228,7 +282,7 @@ Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& r
                                         .created = iso8601(std::chrono::system_clock::now()),
                                         .label = request.label,
                                         .face = std::string(to_string(request.face))},
-                                       parts_.rig, parts_.config.images);
+                                       *rig, parts_.config.images);
   if (!writer) return writer.error();
   if (const auto added = (*writer)->add_shot(*background, *background->find(ShotRole::background)); !added)
     return added.error().code == ErrorCode::disk_full
@@ -241,7 +295,7 @@ Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& r
     const Timestamp zero = parts_.clock.now() + static_cast<Timestamp>(request.countdown_s * 1e9);
     double next_s = request.countdown_s > 0 ? request.countdown_s : -1;
     if (const auto counted = count_down(id, zero - arm_before_zero, zero, next_s, cancelled); !counted) return counted;
-    FrameCollector collector(parts_.cameras, parts_.cameras.ids(), ShotRole::body, 1, parts_.clock);
+    FrameCollector collector = arm(parts_.cameras.ids(), ShotRole::body, 1 + parts_.config.retries);
     collector.wait_armed(parts_.clock.now() + arm_patience, cancelled);
     if (const auto counted = count_down(id, zero, zero, next_s, cancelled); !counted) return counted;
     begin_capturing();
@@ -252,8 +306,13 @@ Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& r
   std::vector<Frame> face;
   if (patterns_wanted(request.face)) {
     auto taken = take_face(id, cancelled);
-    if (!taken) return taken.error();
-    face = std::move(*taken);
+    if (taken)
+      face = std::move(*taken);
+    else if (request.face == FaceMode::active || cancelled.stop_requested())
+      return taken.error();
+    else
+      parts_.events.publish(Alert{Severity::warning, "camera_unavailable",
+                                  "the face is made without the projector: " + taken.error().message});
   }
 
   // The subject may move again; the disk has time.
@@ -294,96 +353,173 @@ Result<void> CaptureSession::count_down(const std::string& id, Timestamp until, 
 void CaptureSession::begin_capturing() {
   {
     const std::lock_guard lock(mutex_);
-    capture_->counting_down = false;
+    operation_->stoppable = false;
   }
   parts_.set_state(BoothState::capturing);
 }
 
-Result<CollectedShot> CaptureSession::fire_and_collect(FrameCollector& collector, int number,
+FrameCollector CaptureSession::arm(std::vector<std::string> cameras, ShotRole role, int count) const {
+  return {parts_.cameras, std::move(cameras), role, count, milliseconds(parts_.config.max_skew_ms), parts_.clock};
+}
+
+Result<CollectedShot> CaptureSession::fire_and_collect(FrameCollector& collector, ShotRole role,
                                                        const std::stop_token& cancelled) {
   pulse_.beat();
   const auto trigger = trigger_.get();
   if (!trigger) return Error{ErrorCode::device_lost, "the trigger cannot be used: " + trigger.error().message};
+  (*trigger)->prepare(role);
   const auto fired = (*trigger)->fire();
   if (!fired) {
     trigger_.lose(fired.error());
     return Error{ErrorCode::device_lost, "the trigger did not fire: " + fired.error().message};
   }
-  CollectedShot shot = collector.collect(number, *fired + milliseconds(parts_.config.frame_timeout_ms), cancelled);
+  CollectedShot shot = collector.collect(*fired, *fired + milliseconds(parts_.config.frame_timeout_ms), cancelled);
   if (cancelled.stop_requested()) return was_cancelled();
+  tell(shot.remarks);
   return shot;
 }
 
+void CaptureSession::tell(const std::vector<std::string>& remarks) {
+  for (const std::string& remark : remarks) {
+    parts_.metrics.add("shot_remarks");
+    parts_.events.publish(Alert{Severity::warning, "camera_unavailable", remark});
+  }
+}
+
+/// The person still stands there: what a camera missed is taken again at once, by all cameras, for the frames of a shot
+/// must show one instant. The shot with the most cameras counts.
 Result<CollectedShot> CaptureSession::take_body(const std::string& id, FrameCollector& collector,
                                                 const std::stop_token& cancelled) {
-  auto shot = fire_and_collect(collector, 0, cancelled);
-  if (!shot) return shot;
-  parts_.events.publish(
-      ShotTaken{id, ShotRole::body, 0, 1, static_cast<int>(shot->set.frames.size()), shot->missing, shot->skew_us});
+  const Timestamp begun = parts_.clock.now();
+  CollectedShot best;
+  int retries = 0;
+  for (int attempt = 0; attempt <= parts_.config.retries; ++attempt) {
+    auto shot = fire_and_collect(collector, ShotRole::body, cancelled);
+    if (!shot) return shot;
+    retries = attempt;
+    const bool worth_it = std::any_of(shot->missing.begin(), shot->missing.end(),
+                                      [&](const std::string& camera) { return collector.is_reachable(camera); });
+    if (attempt == 0 || shot->set.frames.size() > best.set.frames.size()) best = std::move(*shot);
+    if (best.missing.empty() || !worth_it) break;
+  }
+  const Timestamp decided = parts_.clock.now();
+  parts_.metrics.observe("shot_decision_seconds", elapsed_s(begun, decided));
+  parts_.metrics.add("shot_retries", retries);
+  parts_.events.publish(ShotTaken{.capture = id,
+                                  .role = ShotRole::body,
+                                  .index = 0,
+                                  .of = 1,
+                                  .cameras = static_cast<int>(best.set.frames.size()),
+                                  .missing = best.missing,
+                                  .skew_us = best.skew_us,
+                                  .retries = retries,
+                                  .offsets_us = best.offsets_us,
+                                  .decided_ms = 1e3 * elapsed_s(begun, decided)});
+  if (const auto enough = check_enough(best); !enough) return enough.error();
+  for (Frame& frame : best.set.frames) frame.index = 0;
+  return best;
+}
+
+/// @error device_lost  names the cameras that are missing
+Result<void> CaptureSession::check_enough(const CollectedShot& shot) const {
   int delivered = 0;
   for (const std::string& camera : parts_.cameras.ids(CameraRole::body))
-    delivered += std::find(shot->missing.begin(), shot->missing.end(), camera) == shot->missing.end() ? 1 : 0;
-  if (delivered < parts_.config.min_cameras)
-    return Error{ErrorCode::device_lost, "only " + std::to_string(delivered) + " body cameras delivered, at least " +
-                                             std::to_string(parts_.config.min_cameras) +
-                                             " are needed; missing: " + join(shot->missing)};
-  return shot;
+    delivered += std::find(shot.missing.begin(), shot.missing.end(), camera) == shot.missing.end() ? 1 : 0;
+  if (delivered >= parts_.config.min_cameras) return {};
+  return Error{ErrorCode::device_lost, "only " + std::to_string(delivered) + " body cameras delivered, at least " +
+                                           std::to_string(parts_.config.min_cameras) +
+                                           " are needed; missing: " + join(shot.missing)};
 }
 
 bool CaptureSession::patterns_wanted(FaceMode mode) {
   if (mode == FaceMode::active) return true;
   if (mode != FaceMode::automatic || !projector_) return false;
-  const auto projector = projector_->get();
-  if (!projector)
+  const auto without = [&](const std::string& why) {
     parts_.events.publish(
-        Alert{Severity::warning, "camera_unavailable",
-              "the face is made without the projector, which cannot be used: " + projector.error().message});
-  return projector.ok();
+        Alert{Severity::warning, "camera_unavailable", "the face is made without the projector: " + why});
+    return false;
+  };
+  if (!parts_.rig()->projector) return without("it is not calibrated");
+  if (parts_.cameras.ids(CameraRole::face).empty()) return without("the booth has no face cameras");
+  const auto projector = projector_->get();
+  return projector || without("it cannot be used: " + projector.error().message);
 }
 
+/// Pattern by pattern. Frames come back with the pattern's index.
 Result<std::vector<Frame>> CaptureSession::take_face(const std::string& id, const std::stop_token& cancelled) {
   const auto opened = projector_->get();
   if (!opened) return Error{ErrorCode::device_lost, "the projector cannot be used: " + opened.error().message};
   // Nobody is left in a flickering light, whichever way this ends.
-  std::unique_ptr<Projector, void (*)(Projector*)> projector(*opened, [](Projector* lit) { lit->dark(); });
+  struct Darkened {
+    Projector* projector;
+    ~Darkened() {
+      if (projector != nullptr) projector->dark();
+    }
+  } lit{*opened};
 
-  const int patterns = pattern_count(projector->info().pattern);
-  const std::vector<std::string> cameras = parts_.cameras.ids(CameraRole::face);
-  FrameCollector collector(parts_.cameras, cameras, ShotRole::gray_code, patterns + most_repeats, parts_.clock);
+  const int patterns = pattern_count(lit.projector->info().pattern);
+  FrameCollector collector = arm(parts_.cameras.ids(CameraRole::face), ShotRole::gray_code, patterns + most_repeats);
   collector.wait_armed(parts_.clock.now() + arm_patience, cancelled);
 
   std::vector<Frame> frames;
-  int triggers = 0, repeats = 0;
+  int repeats_left = most_repeats;
   for (int pattern = 0; pattern < patterns; ++pattern) {
-    std::map<std::string, Frame> delivered;
-    double skew_us = 0;
-    for (;;) {
-      if (cancelled.stop_requested()) return was_cancelled();
-      if (collector.reachable() == 0)
-        return Error{ErrorCode::device_lost, "no face camera takes the projected patterns: " + join(cameras)};
-      if (const auto shown = projector->show(pattern); !shown) {
-        projector.reset();
-        projector_->lose(shown.error());
-        return Error{ErrorCode::device_lost, "the projector failed: " + shown.error().message};
+    auto taken = take_pattern(id, *lit.projector, pattern, collector, repeats_left, cancelled);
+    if (!taken) {
+      // One that does not show what it should is opened anew next time, which leaves it dark.
+      if (taken.error().code == ErrorCode::io) {
+        lit.projector = nullptr;
+        projector_->lose(taken.error());
+        return Error{ErrorCode::device_lost, taken.error().message};
       }
-      auto shot = fire_and_collect(collector, triggers++, cancelled);
-      if (!shot) return shot.error();
-      skew_us = shot->skew_us;
-      for (Frame& frame : shot->set.frames) {
-        frame.index = pattern;
-        delivered.try_emplace(frame.camera, std::move(frame));
-      }
-      if (delivered.size() >= collector.reachable() || repeats == most_repeats) break;
-      ++repeats;
+      return taken.error();
     }
-    std::vector<std::string> missing;
-    for (const std::string& camera : cameras)
-      if (!delivered.contains(camera)) missing.push_back(camera);
-    parts_.events.publish(
-        ShotTaken{id, ShotRole::gray_code, pattern, patterns, static_cast<int>(delivered.size()), missing, skew_us});
-    for (auto& [camera, frame] : delivered) frames.push_back(std::move(frame));
+    for (auto& [camera, frame] : *taken) frames.push_back(std::move(frame));
   }
   return frames;
+}
+
+/// Shows one pattern and takes it with every face camera; once more, as long as `repeats_left` lasts, where one missed
+/// it. @error io  the projector failed; device_lost  no camera is left that could take it, or the trigger failed
+Result<std::map<std::string, Frame>> CaptureSession::take_pattern(const std::string& id, Projector& projector,
+                                                                  int pattern, FrameCollector& collector,
+                                                                  int& repeats_left, const std::stop_token& cancelled) {
+  const std::vector<std::string> cameras = parts_.cameras.ids(CameraRole::face);
+  const Timestamp begun = parts_.clock.now();
+  std::map<std::string, Frame> delivered;
+  ShotTaken report{.capture = id,
+                   .role = ShotRole::gray_code,
+                   .index = pattern,
+                   .of = pattern_count(projector.info().pattern),
+                   .cameras = 0,
+                   .missing = {},
+                   .skew_us = 0};
+  for (;; ++report.retries, --repeats_left) {
+    if (cancelled.stop_requested()) return was_cancelled();
+    if (collector.reachable() == 0)
+      return Error{ErrorCode::device_lost, "no face camera takes the projected patterns: " + join(cameras)};
+    if (const auto shown = projector.show(pattern); !shown)
+      return Error{ErrorCode::io, "the projector failed: " + shown.error().message};
+    auto shot = fire_and_collect(collector, ShotRole::gray_code, cancelled);
+    if (!shot) return shot.error();
+    report.skew_us = std::max(report.skew_us, shot->skew_us);
+    for (Frame& frame : shot->set.frames) {
+      frame.index = pattern;
+      report.offsets_us.try_emplace(frame.camera, shot->offsets_us[frame.camera]);
+      delivered.try_emplace(frame.camera, std::move(frame));
+    }
+    const bool worth_it = std::any_of(cameras.begin(), cameras.end(), [&](const std::string& camera) {
+      return !delivered.contains(camera) && collector.is_reachable(camera);
+    });
+    if (!worth_it || repeats_left == 0) break;
+  }
+  parts_.metrics.add("shot_retries", report.retries);
+  report.cameras = static_cast<int>(delivered.size());
+  for (const std::string& camera : cameras)
+    if (!delivered.contains(camera)) report.missing.push_back(camera);
+  report.decided_ms = 1e3 * elapsed_s(begun, parts_.clock.now());
+  parts_.events.publish(report);
+  return delivered;
 }
 
 Result<void> CaptureSession::write(RecordingWriter& writer, const std::string& shot, const std::vector<Frame>& frames,
@@ -399,6 +535,105 @@ Result<void> CaptureSession::write(RecordingWriter& writer, const std::string& s
   });
   if (cancelled.stop_requested()) return was_cancelled();
   return outcome;
+}
+
+Result<TaskResult> CaptureSession::work(const std::string& task, const BackgroundRequest& request,
+                                        const std::stop_token& cancelled) {
+  if (const auto room = parts_.check_disk(); !room) return room.error();
+  const auto rig = parts_.rig();
+  if (rig == nullptr) return Error{ErrorCode::not_calibrated, "the booth is not calibrated"};
+  const auto now = std::chrono::system_clock::now();
+  const std::string id = make_capture_id(now);
+  BackgroundLearned learned{.created = iso8601(now), .missing = {}, .warnings = {}};
+  auto writer = parts_.backgrounds.begin(*rig, parts_.config.images, id, learned.created);
+  if (!writer) return writer.error();
+  if (const auto begun = (*writer)->begin_shot({.name = background_shot, .role = ShotRole::background}); !begun)
+    return begun.error();
+  const auto views = take_background(task, request.frames, **writer, cancelled);
+  if (!views) return views.error();
+
+  // Whoever stands in the booth now would be missing from every avatar.
+  std::vector<std::string> moved;
+  for (const auto& [camera, seen] : *views) {
+    learned.frames = std::max(learned.frames, static_cast<int>(seen.size()));
+    if (changed_share(seen) > moved_share) moved.push_back(camera);
+  }
+  if (!moved.empty())
+    return Error{ErrorCode::not_ready,
+                 "something moved in front of " + join(moved) +
+                     ": the booth must be empty and its light steady; learn the background again"};
+  if (const auto warning = compare_with_last(*views)) learned.warnings.push_back(*warning);
+  for (const std::string& camera : parts_.cameras.ids())
+    if (!views->contains(camera)) learned.missing.push_back(camera);
+  if (!learned.missing.empty())
+    learned.warnings.push_back("the background was learned without " + join(learned.missing) +
+                               ", which delivered no frame");
+
+  if (cancelled.stop_requested()) return was_cancelled();
+  if (const auto stored = parts_.backgrounds.finish(**writer, id); !stored) return stored.error();
+  for (const std::string& warning : learned.warnings)
+    parts_.events.publish(Alert{Severity::warning, "no_background", warning});
+  return TaskResult(learned);
+}
+
+/// Writes frames of the empty booth, numbered by camera, and returns what they show.
+Result<CaptureSession::Views> CaptureSession::take_background(const std::string& task, int frames,
+                                                              RecordingWriter& writer,
+                                                              const std::stop_token& cancelled) {
+  const int triggers = frames + background_repeats;
+  FrameCollector collector = arm(parts_.cameras.ids(), ShotRole::background, triggers);
+  collector.wait_armed(parts_.clock.now() + arm_patience, cancelled);
+  Views views;
+  for (int trigger = 0; trigger < triggers; ++trigger) {
+    auto shot = fire_and_collect(collector, ShotRole::background, cancelled);
+    if (!shot) return shot.error();
+    if (trigger == 0)
+      if (const auto enough = check_enough(*shot); !enough) return enough.error();
+    std::vector<Frame> wanted;
+    for (Frame& frame : shot->set.frames) {
+      std::vector<CoarseView>& seen = views[frame.camera];
+      if (seen.size() == static_cast<size_t>(frames)) continue;
+      frame.index = static_cast<int>(seen.size());
+      seen.push_back(coarse_view(frame));
+      wanted.push_back(std::move(frame));
+    }
+    if (const auto written = write(writer, background_shot, wanted, cancelled); !written) return written.error();
+    parts_.tasks.progress(task, std::min(1.0, (trigger + 1.0) / frames));
+    if (std::all_of(views.begin(), views.end(),
+                    [&](const auto& view) { return view.second.size() == static_cast<size_t>(frames); }))
+      break;
+    std::unique_lock lock(mutex_);
+    changed_.wait_for(lock, cancelled, background_pause, [] { return false; });
+  }
+  return views;
+}
+
+/// A sentence when most cameras see something else than when the background was learned last.
+std::optional<std::string> CaptureSession::compare_with_last(const Views& views) const {
+  const auto before = parts_.backgrounds.current();
+  if (before == nullptr) return std::nullopt;
+  size_t compared = 0, altered = 0;
+  for (const FrameRecord& record : before->find(ShotRole::background)->frames) {
+    const auto seen = views.find(record.camera);
+    if (seen == views.end() || record.index != 0) continue;
+    const auto earlier = load_frame(*before, record);
+    if (!earlier) continue;
+    ++compared;
+    const std::vector<CoarseView> pair{coarse_view(*earlier), seen->second.front()};
+    altered += changed_share(pair) > altered_share ? 1 : 0;
+  }
+  if (2 * altered <= compared) return std::nullopt;
+  return "the booth looks different from when it was learned last, for " + std::to_string(altered) + " of " +
+         std::to_string(compared) + " cameras: if somebody stood in it, learn the background again";
+}
+
+Result<TaskResult> CaptureSession::work(const std::string&, const TriggerTestRequest&,
+                                        const std::stop_token& cancelled) {
+  FrameCollector collector = arm(parts_.cameras.ids(), ShotRole::body, 1);
+  collector.wait_armed(parts_.clock.now() + arm_patience, cancelled);
+  const auto shot = fire_and_collect(collector, ShotRole::body, cancelled);
+  if (!shot) return shot.error();
+  return TaskResult(TriggerTested{shot->offsets_us, shot->missing, shot->skew_us, shot->remarks});
 }
 
 }  // namespace booth

@@ -4,22 +4,27 @@
 #include <deque>
 #include <filesystem>
 #include <functional>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <optional>
 #include <stop_token>
 #include <string>
 #include <thread>
+#include <variant>
+#include <vector>
 
 #include "config/booth_config.h"
 #include "daemon/background_store.h"
 #include "daemon/camera_supervisor.h"
 #include "daemon/device_slot.h"
+#include "daemon/empty_booth.h"
 #include "daemon/event_bus.h"
 #include "daemon/frame_collector.h"
 #include "daemon/job_queue.h"
 #include "daemon/metrics.h"
 #include "daemon/pulse.h"
+#include "daemon/task_board.h"
 #include "drivers/device_source.h"
 #include "pipeline/reconstruct.h"
 #include "pipeline/thread_pool.h"
@@ -33,13 +38,24 @@ struct CaptureRequest {
   std::string label = {};  ///< may be empty
 };
 
+/// The empty booth is to be learned.
+struct BackgroundRequest {
+  int frames = 10;  ///< of each camera, 1 … 100
+};
+
+/// One trigger is to be fired, to see which cameras answer and when.
+struct TriggerTestRequest {};
+
 /// What a capture works with; all of it outlives the session.
 struct CaptureParts {
   CaptureConfig config;
   std::filesystem::path recordings;
   std::shared_ptr<DeviceSource> source;
-  Rig rig;
+  std::string trigger;                              ///< its driver's name
+  std::optional<std::string> projector;             ///< its id, where the booth has one
+  std::function<std::shared_ptr<const Rig>()> rig;  ///< the current one; null while the booth is not calibrated
   CameraSupervisor& cameras;
+  TaskBoard& tasks;
   BackgroundStore& backgrounds;
   JobQueue& jobs;
   EventBus& events;
@@ -49,8 +65,9 @@ struct CaptureParts {
   std::function<Result<void>()> check_disk;   ///< @error disk_full
 };
 
-/// Takes captures, one at a time, on a thread of its own: countdown, the body shot, the face's patterns, a durable
-/// recording, a queued job. Either all of that, or nothing remains. Any thread may call.
+/// Does what needs the cameras together, one thing at a time, on a thread of its own. A capture: countdown, the body
+/// shot, the face's patterns, a durable recording, a queued job; either all of that, or nothing remains. Learning the
+/// background and testing the trigger: tasks. Any thread may call.
 class CaptureSession {
  public:
   explicit CaptureSession(CaptureParts parts);
@@ -58,6 +75,10 @@ class CaptureSession {
 
   /// Begins a capture. @return its id; @error busy  another one is under way
   Result<std::string> start(const CaptureRequest& request);
+  /// Begins a task. @return its id; @error busy, not_calibrated
+  Result<std::string> learn_background(const BackgroundRequest& request);
+  /// Likewise. @error busy
+  Result<std::string> test_trigger();
   /// @error invalid_state  it is over, or can no longer be stopped; not_found
   Result<void> cancel(const std::string& id);
   /// Of a capture under way nothing will remain, whatever it has done so far. Others: nothing happens.
@@ -65,7 +86,10 @@ class CaptureSession {
   /// Waits until that capture is no longer under way.
   void wait_over(const std::string& id);
 
+  /// The capture under way.
   std::optional<std::string> current() const;
+  /// What is under way, capture or task, as a sentence.
+  std::optional<std::string> occupation() const;
   DeviceStatus trigger() const { return trigger_.status(); }
   std::optional<DeviceStatus> projector() const;
   Pulse::TimePoint last_pulse() const { return pulse_.last(); }
@@ -74,17 +98,25 @@ class CaptureSession {
   void drain(std::chrono::milliseconds patience);
 
  private:
-  struct Capture {
-    std::string id;
-    CaptureRequest request;
+  using Request = std::variant<CaptureRequest, BackgroundRequest, TriggerTestRequest>;
+  /// The one thing that is under way.
+  struct Operation {
+    std::string id;  ///< the capture's, or the task's
+    Request request;
     std::stop_source stop;
-    bool counting_down = true;
+    bool stoppable = true;    ///< nobody stands there yet: stopping the booth need not wait for it
     bool committing = false;  ///< it can no longer be cancelled
     bool abandoned = false;
+    bool is_capture() const { return std::holds_alternative<CaptureRequest>(request); }
   };
   void run(const std::stop_token& stop);
   void tend_devices();
+  Result<void> begin(const std::string& id, const Request& request, BoothState state);
+  Result<std::string> begin_task(TaskKind kind, const Request& request, BoothState state);
+  void end_operation(bool failed);
   void carry_out(const std::string& id, const CaptureRequest& request, const std::stop_token& cancelled);
+  template <class TaskRequest>
+  void carry_out(const std::string& id, const TaskRequest& request, const std::stop_token& cancelled);
   bool conclude(const std::string& id, const CaptureRequest& request, bool taken);
 
   // The steps of a capture, in their order.
@@ -93,10 +125,24 @@ class CaptureSession {
                           const std::stop_token& cancelled);
   Result<CollectedShot> take_body(const std::string& id, FrameCollector& collector, const std::stop_token& cancelled);
   Result<std::vector<Frame>> take_face(const std::string& id, const std::stop_token& cancelled);
+  Result<std::map<std::string, Frame>> take_pattern(const std::string& id, Projector& projector, int pattern,
+                                                    FrameCollector& collector, int& repeats_left,
+                                                    const std::stop_token& cancelled);
   Result<void> write(RecordingWriter& writer, const std::string& shot, const std::vector<Frame>& frames,
                      const std::stop_token& cancelled);
 
-  Result<CollectedShot> fire_and_collect(FrameCollector& collector, int number, const std::stop_token& cancelled);
+  // The tasks.
+  Result<TaskResult> work(const std::string& task, const BackgroundRequest& request, const std::stop_token& cancelled);
+  Result<TaskResult> work(const std::string& task, const TriggerTestRequest& request, const std::stop_token& cancelled);
+  using Views = std::map<std::string, std::vector<CoarseView>>;  ///< by camera, in their order
+  Result<Views> take_background(const std::string& task, int frames, RecordingWriter& writer,
+                                const std::stop_token& cancelled);
+  std::optional<std::string> compare_with_last(const Views& views) const;
+
+  FrameCollector arm(std::vector<std::string> cameras, ShotRole role, int count) const;
+  Result<CollectedShot> fire_and_collect(FrameCollector& collector, ShotRole role, const std::stop_token& cancelled);
+  void tell(const std::vector<std::string>& remarks);
+  Result<void> check_enough(const CollectedShot& shot) const;
   bool begin_commit(const std::string& id);
   void begin_capturing();
   bool patterns_wanted(FaceMode mode);
@@ -107,13 +153,13 @@ class CaptureSession {
   ThreadPool encoders_;
   Pulse pulse_;
 
-  std::mutex transition_mutex_;  ///< held from a capture's beginning, or end, until the state says so; before mutex_
+  std::mutex transition_mutex_;  ///< held from an operation's beginning, or end, until the state says so; before mutex_
   mutable std::mutex mutex_;
   std::condition_variable_any changed_;
-  std::optional<Capture> capture_;  ///< guarded by mutex_; the one under way
-  bool pending_ = false;            ///< guarded by mutex_; it waits for the thread
-  bool draining_ = false;           ///< guarded by mutex_
-  std::deque<std::string> over_;    ///< guarded by mutex_; captures of this boot that failed, the newest last
+  std::optional<Operation> operation_;  ///< guarded by mutex_; the one under way
+  bool pending_ = false;                ///< guarded by mutex_; it waits for the thread
+  bool draining_ = false;               ///< guarded by mutex_
+  std::deque<std::string> over_;        ///< guarded by mutex_; captures of this boot that failed, the newest last
   std::jthread thread_;
 };
 

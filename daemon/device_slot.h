@@ -1,5 +1,7 @@
 #pragma once
 
+#include <algorithm>
+#include <chrono>
 #include <functional>
 #include <memory>
 #include <mutex>
@@ -12,14 +14,20 @@
 
 namespace booth {
 
+/// Whether opening a device again is of no use as long as nobody changes anything.
+inline bool is_permanent(ErrorCode code) {
+  return code == ErrorCode::invalid_argument || code == ErrorCode::unsupported || code == ErrorCode::not_found;
+}
+
 struct DeviceStatus {
   std::string name;  ///< the projector's id, the trigger's driver
   DeviceState state = DeviceState::offline;
   std::string message;
+  bool permanent = false;  ///< what keeps it offline does not mend itself
 };
 
-/// Keeps one device (the trigger, the projector) open: opens it again after a loss. One thread uses the device; any
-/// thread may ask for the status.
+/// Keeps one device (the trigger, the projector) open: opens it again after a loss, with growing patience. One thread
+/// uses the device; any thread may ask for the status.
 template <class Device>
 class DeviceSlot {
  public:
@@ -31,15 +39,28 @@ class DeviceSlot {
   Result<Device*> get() {
     if (device_) return device_.get();
     auto opened = open_();
-    if (!opened) return set(DeviceState::offline, opened.error().message), opened.error();
+    if (!opened) {
+      set(DeviceState::offline, opened.error());
+      return opened.error();
+    }
     device_ = std::move(*opened);
-    set(DeviceState::online, "");
+    set(DeviceState::online, {});
     return device_.get();
+  }
+  /// Tries to open it where it is not there and it is time to try again.
+  void tend(std::chrono::steady_clock::time_point now) {
+    if (device_ || now < next_try_) return;
+    if (get()) {
+      patience_ = first_patience;
+      return;
+    }
+    next_try_ = now + patience_;
+    patience_ = std::min(2 * patience_, most_patience);
   }
   /// It is gone, or misbehaves: the next get() opens it anew.
   void lose(const Error& error) {
     device_.reset();
-    set(DeviceState::offline, error.message);
+    set(DeviceState::offline, error);
   }
   DeviceStatus status() const {
     const std::lock_guard lock(mutex_);
@@ -47,14 +68,19 @@ class DeviceSlot {
   }
 
  private:
-  void set(DeviceState state, const std::string& message) {
+  static constexpr std::chrono::milliseconds first_patience{1000}, most_patience{10'000};
+
+  void set(DeviceState state, const Error& error) {
     const std::lock_guard lock(mutex_);
     status_.state = state;
-    status_.message = message;
+    status_.message = error.message;
+    status_.permanent = state == DeviceState::offline && is_permanent(error.code);
   }
 
   const Open open_;
   std::unique_ptr<Device> device_;
+  std::chrono::steady_clock::time_point next_try_{};
+  std::chrono::milliseconds patience_ = first_patience;
   mutable std::mutex mutex_;
   DeviceStatus status_;  ///< guarded by mutex_
 };

@@ -2,11 +2,14 @@
 
 #include <chrono>
 #include <cstdint>
+#include <map>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <variant>
 #include <vector>
 
+#include "drivers/camera.h"
 #include "pipeline/types/result.h"
 #include "pipeline/types/shot.h"
 
@@ -17,6 +20,12 @@ std::string_view to_string(BoothState state);
 
 enum class DeviceState { online, offline, degraded };
 std::string_view to_string(DeviceState state);
+
+enum class TaskKind { discover, background, trigger_test, calibration_capture, calibration_solve };
+std::string_view to_string(TaskKind kind);
+
+enum class TaskState { running, done, failed };
+std::string_view to_string(TaskState state);
 
 enum class Severity { info, warning, error };
 std::string_view to_string(Severity severity);
@@ -45,7 +54,10 @@ struct ShotTaken {
   int of;       ///< triggers of the shot
   int cameras;  ///< how many delivered
   std::vector<std::string> missing;
-  double skew_us;  ///< between the first and the last exposure
+  double skew_us;                                 ///< between the first and the last exposure
+  int retries = 0;                                ///< triggers that were fired again because somebody missed one
+  std::map<std::string, double> offsets_us = {};  ///< by camera: from its trigger to its exposure
+  double decided_ms = 0;                          ///< from the first trigger until it was clear what the shot has
 };
 struct CaptureDone {
   std::string capture, job;
@@ -77,6 +89,36 @@ struct CameraChanged {
   DeviceState state;
   std::string message;
 };
+/// Every camera that the drivers see.
+struct CamerasDiscovered {
+  struct Seen {
+    CameraInfo camera;
+    bool configured = false;
+  };
+  std::vector<Seen> cameras;
+  std::vector<std::string> faults;  ///< sentences: drivers that could not look
+};
+struct BackgroundLearned {
+  std::string created;
+  int frames = 0;                     ///< of each camera, at most
+  std::vector<std::string> missing;   ///< cameras that delivered none
+  std::vector<std::string> warnings;  ///< sentences
+};
+struct TriggerTested {
+  std::map<std::string, double> offsets_us;  ///< by camera: from the trigger to its exposure
+  std::vector<std::string> missing;
+  double skew_us = 0;
+  std::vector<std::string> warnings;  ///< sentences
+};
+using TaskResult = std::variant<std::monostate, CamerasDiscovered, BackgroundLearned, TriggerTested>;
+struct TaskChanged {
+  std::string task;
+  TaskKind kind;
+  TaskState state;
+  double fraction = 0;
+  TaskResult result;           ///< of one that is done
+  std::optional<Error> error;  ///< of one that failed
+};
 struct Alert {
   Severity severity;
   std::string kind, message;
@@ -87,7 +129,7 @@ struct Heartbeat {
 };
 
 using Event = std::variant<StateChanged, CountdownTick, ShotTaken, CaptureDone, CaptureFailed, JobProgressed, JobFailed,
-                           JobCancelled, AvatarPublished, AvatarDeleted, CameraChanged, Alert, Heartbeat>;
+                           JobCancelled, AvatarPublished, AvatarDeleted, CameraChanged, TaskChanged, Alert, Heartbeat>;
 
 struct NumberedEvent {
   uint64_t sequence;  ///< from 1, without gaps

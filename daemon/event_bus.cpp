@@ -29,6 +29,26 @@ std::string_view to_string(DeviceState state) {
   return "offline";
 }
 
+std::string_view to_string(TaskKind kind) {
+  switch (kind) {
+    case TaskKind::discover: return "discover";
+    case TaskKind::background: return "background";
+    case TaskKind::trigger_test: return "trigger_test";
+    case TaskKind::calibration_capture: return "calibration_capture";
+    case TaskKind::calibration_solve: return "calibration_solve";
+  }
+  return "discover";
+}
+
+std::string_view to_string(TaskState state) {
+  switch (state) {
+    case TaskState::running: return "running";
+    case TaskState::done: return "done";
+    case TaskState::failed: return "failed";
+  }
+  return "failed";
+}
+
 std::string_view to_string(Severity severity) {
   switch (severity) {
     case Severity::info: return "info";

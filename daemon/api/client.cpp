@@ -86,7 +86,12 @@ std::optional<ReceivedEvent> Client::next_event(std::chrono::milliseconds patien
   if (!wait_readable(sockets_->events, SteadyClock::now() + patience)) return std::nullopt;
   const auto frames = receive(sockets_->events);
   if (frames.size() < 2) return std::nullopt;
-  return ReceivedEvent{frames[0].to_string(), Json::parse(frames[1].to_string_view(), nullptr, false)};
+  ReceivedEvent event{frames[0].to_string(), Json::parse(frames[1].to_string_view(), nullptr, false)};
+  if (frames.size() > 2) {
+    const auto* bytes = frames[2].data<uint8_t>();
+    event.bytes.assign(bytes, bytes + frames[2].size());
+  }
+  return event;
 }
 
 }  // namespace booth::api

@@ -25,6 +25,7 @@ struct CallReply {
 struct ReceivedEvent {
   std::string topic;
   nlohmann::json fields;
+  std::vector<uint8_t> bytes = {};  ///< of a preview: its JPEG
 };
 
 /// The other side of the interface: one client, for one thread.

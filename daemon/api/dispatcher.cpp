@@ -33,6 +33,12 @@ Json to_json(const std::vector<Job>& jobs) {
   return list;
 }
 
+/// Of a device that is offline: whether waiting may help, or only a changed setting.
+Json fault_of(DeviceState state, bool permanent) {
+  if (state != DeviceState::offline) return nullptr;
+  return permanent ? "permanent" : "temporary";
+}
+
 Json to_json(const CameraStatus& camera) {
   return {{"id", camera.id},
           {"driver", camera.driver},
@@ -41,22 +47,33 @@ Json to_json(const CameraStatus& camera) {
           {"last_frame_age_s", camera.last_frame_age_s ? Json(*camera.last_frame_age_s) : Json(nullptr)},
           {"frames", camera.frames},
           {"dropped", camera.dropped},
-          {"message", text_or_null(camera.message)}};
+          {"message", text_or_null(camera.message)},
+          {"fault", fault_of(camera.state, camera.permanent)}};
 }
 
 /// @param name  what the interface calls the device's name: the projector's `id`, the trigger's `driver`
 Json to_json(const std::optional<DeviceStatus>& device, const char* name) {
   if (!device) return nullptr;
-  return {{name, device->name}, {"state", to_string(device->state)}, {"message", text_or_null(device->message)}};
+  return {{name, device->name},
+          {"state", to_string(device->state)},
+          {"message", text_or_null(device->message)},
+          {"fault", fault_of(device->state, device->permanent)}};
 }
 
 Answer unsupported(const std::string& what) {
   return Error{ErrorCode::unsupported, what + " is not offered by this version"};
 }
 
-template <class Request>
-Answer unsupported_after(const Result<Request>& request, const std::string& what) {
-  return request ? unsupported(what) : request.error();
+Answer task_answer(const Result<std::string>& task) {
+  if (!task) return task.error();
+  return Reply{{{"task", *task}}};
+}
+
+Json to_json(const std::vector<Task>& tasks) {
+  Json list = Json::array();
+  for (const Task& task : tasks)
+    list.push_back({{"task", task.id}, {"kind", to_string(task.kind)}, {"fraction", task.fraction}});
+  return list;
 }
 
 }  // namespace
@@ -88,12 +105,11 @@ std::optional<Reply> Dispatcher::dispatch(Method method, const Json& params, con
     case Method::system_status: respond(no_params([&] { return status(); })); break;
     case Method::system_metrics: respond(no_params([&] { return metrics(); })); break;
     case Method::system_shutdown: respond(no_params([&] { return shut_down_(), Answer(Reply{}); })); break;
-    case Method::camera_discover: respond(no_params([] { return unsupported("looking for cameras"); })); break;
-    case Method::preview_start: respond(unsupported_after(parse_preview_start(params), "the preview")); break;
-    case Method::preview_stop: respond(unsupported_after(parse_preview_stop(params), "the preview")); break;
-    case Method::background_learn:
-      respond(unsupported_after(parse_background_learn(params), "learning the background"));
-      break;
+    case Method::camera_discover: respond(no_params([&] { return task_answer(booth_.discover_cameras()); })); break;
+    case Method::preview_start: respond(start_preview(params)); break;
+    case Method::preview_stop: respond(stop_preview(params)); break;
+    case Method::background_learn: respond(learn_background(params)); break;
+    case Method::trigger_test: respond(no_params([&] { return task_answer(booth_.test_trigger()); })); break;
     case Method::calibration_capture:
     case Method::calibration_solve:
     case Method::calibration_apply:
@@ -120,11 +136,13 @@ std::optional<Reply> Dispatcher::dispatch(Method method, const Json& params, con
 Answer Dispatcher::describe() const {
   Json names = Json::array();
   for (const MethodEntry& entry : methods) names.push_back(entry.name);
+  std::vector<std::string> every_topic = topics();
+  for (const CameraStatus& camera : booth_.status().cameras) every_topic.push_back(preview_topic(camera.id));
   return Reply{{{"name", booth_.name()},
                 {"version", BOOTH_VERSION},
                 {"api", api_version},
                 {"methods", names},
-                {"topics", topics()},
+                {"topics", every_topic},
                 {"stages", job_stages()}}};
 }
 
@@ -140,7 +158,7 @@ Answer Dispatcher::status() const {
        {"ready", status.not_ready.empty()},
        {"not_ready", api::to_json(status.not_ready)},
        {"capture", status.capture ? Json(*status.capture) : Json(nullptr)},
-       {"tasks", Json::array()},
+       {"tasks", to_json(status.tasks)},
        {"cameras", cameras},
        {"projector", to_json(status.projector, "id")},
        {"trigger", to_json(status.trigger, "driver")},
@@ -162,6 +180,28 @@ Answer Dispatcher::start_capture(const Json& params) {
   const auto started = booth_.start_capture(*request);
   if (!started) return started.error();
   return Reply{{{"capture", *started}}};
+}
+
+Answer Dispatcher::start_preview(const Json& params) {
+  const auto request = parse_preview_start(params);
+  if (!request) return request.error();
+  const auto started = booth_.start_preview(request->camera, request->settings);
+  if (!started) return started.error();
+  return Reply{};
+}
+
+Answer Dispatcher::stop_preview(const Json& params) {
+  const auto request = parse_id(params, "camera");
+  if (!request) return request.error();
+  const auto stopped = booth_.stop_preview(request->id);
+  if (!stopped) return stopped.error();
+  return Reply{};
+}
+
+Answer Dispatcher::learn_background(const Json& params) {
+  const auto request = parse_background_learn(params);
+  if (!request) return request.error();
+  return task_answer(booth_.learn_background(request->frames));
 }
 
 Answer Dispatcher::list_jobs(const Json& params) {

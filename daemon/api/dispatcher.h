@@ -46,6 +46,9 @@ class Dispatcher {
   Answer list_jobs(const nlohmann::json& params);
   Answer list_avatars(const nlohmann::json& params);
   Answer start_capture(const nlohmann::json& params);
+  Answer start_preview(const nlohmann::json& params);
+  Answer stop_preview(const nlohmann::json& params);
+  Answer learn_background(const nlohmann::json& params);
   void get_avatar(const nlohmann::json& params, const Responder& respond);
   void fetch_avatar(const nlohmann::json& params, const Responder& respond);
   std::optional<Reply> change_job(Method method, const nlohmann::json& params, const Responder& respond);

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "daemon/event.h"
+#include "daemon/preview_board.h"
 
 namespace booth::api {
 
@@ -14,7 +15,11 @@ struct EncodedEvent {
 };
 EncodedEvent encode(const NumberedEvent& event, const std::string& boot);
 
-/// Every topic that encode() gives, in the order of the interface's contract.
+/// The first two frames of a preview's picture; the third is its JPEG.
+EncodedEvent encode(const PreviewPicture& picture, const std::string& boot);
+std::string preview_topic(const std::string& camera);
+
+/// Every topic that events have, in the order of the interface's contract.
 std::vector<std::string> topics();
 
 }  // namespace booth::api

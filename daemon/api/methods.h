@@ -16,6 +16,7 @@ enum class Method {
   preview_start,
   preview_stop,
   background_learn,
+  trigger_test,
   calibration_capture,
   calibration_solve,
   calibration_apply,
@@ -38,7 +39,7 @@ struct MethodEntry {
   bool changes;  ///< changes or starts something, and so takes a `key`
 };
 
-inline constexpr std::array<MethodEntry, 22> methods{{
+inline constexpr std::array<MethodEntry, 23> methods{{
     {Method::system_describe, "system.describe", false},
     {Method::system_status, "system.status", false},
     {Method::system_metrics, "system.metrics", false},
@@ -47,6 +48,7 @@ inline constexpr std::array<MethodEntry, 22> methods{{
     {Method::preview_start, "preview.start", true},
     {Method::preview_stop, "preview.stop", true},
     {Method::background_learn, "background.learn", true},
+    {Method::trigger_test, "trigger.test", true},
     {Method::calibration_capture, "calibration.capture", true},
     {Method::calibration_solve, "calibration.solve", true},
     {Method::calibration_apply, "calibration.apply", true},

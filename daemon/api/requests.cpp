@@ -95,14 +95,10 @@ Result<PreviewStart> parse_preview_start(const Json& params) {
   Reader reader(params);
   PreviewStart request;
   request.camera = reader.required_text("camera");
-  if (const auto fps = reader.whole("fps", 1, 30, "1 … 30")) request.fps = static_cast<int>(*fps);
-  if (const auto width = reader.whole("max_width", 1, 65536, "1 … 65536")) request.max_width = static_cast<int>(*width);
+  if (const auto fps = reader.whole("fps", 1, 30, "1 … 30")) request.settings.fps = static_cast<int>(*fps);
+  if (const auto width = reader.whole("max_width", 1, 65536, "1 … 65536"))
+    request.settings.max_width = static_cast<int>(*width);
   return reader.finish(request);
-}
-
-Result<PreviewStop> parse_preview_stop(const Json& params) {
-  Reader reader(params);
-  return reader.finish(PreviewStop{reader.required_text("camera")});
 }
 
 Result<BackgroundLearn> parse_background_learn(const Json& params) {

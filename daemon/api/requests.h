@@ -6,6 +6,7 @@
 #include <string>
 
 #include "daemon/capture_session.h"
+#include "daemon/preview_board.h"
 #include "pipeline/types/result.h"
 
 namespace booth::api {
@@ -16,16 +17,12 @@ constexpr uint64_t most_fetch_bytes = 8 * 1024 * 1024;
 struct NoParams {};
 struct PreviewStart {
   std::string camera;
-  int fps = 10;
-  int max_width = 640;
-};
-struct PreviewStop {
-  std::string camera;
+  PreviewSettings settings;
 };
 struct BackgroundLearn {
-  int frames = 10;
+  std::optional<int> frames;
 };
-/// Of the methods that take one id: of a capture, a job or an avatar.
+/// Of the methods that take one id: of a camera, a capture, a job or an avatar.
 struct IdParams {
   std::string id;
 };
@@ -46,10 +43,9 @@ struct AvatarFetch {
 // a member that is missing or that nobody asked for
 Result<NoParams> parse_no_params(const nlohmann::json& params);
 Result<PreviewStart> parse_preview_start(const nlohmann::json& params);
-Result<PreviewStop> parse_preview_stop(const nlohmann::json& params);
 Result<BackgroundLearn> parse_background_learn(const nlohmann::json& params);
 Result<CaptureRequest> parse_capture_start(const nlohmann::json& params);
-/// @param member  "capture", "job" or "avatar"
+/// @param member  "camera", "capture", "job" or "avatar"
 Result<IdParams> parse_id(const nlohmann::json& params, const char* member);
 Result<JobList> parse_job_list(const nlohmann::json& params);
 Result<AvatarList> parse_avatar_list(const nlohmann::json& params);

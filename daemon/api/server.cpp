@@ -433,6 +433,12 @@ void Server::Content::publish() {
     events.send(zmq::buffer(encoded.topic), zmq::send_flags::sndmore | zmq::send_flags::dontwait);
     events.send(zmq::buffer(encoded.json), zmq::send_flags::dontwait);
   }
+  for (const PreviewPicture& picture : booth.take_previews()) {
+    const EncodedEvent encoded = encode(picture, booth.events().boot());
+    events.send(zmq::buffer(encoded.topic), zmq::send_flags::sndmore | zmq::send_flags::dontwait);
+    events.send(zmq::buffer(encoded.json), zmq::send_flags::sndmore | zmq::send_flags::dontwait);
+    events.send(zmq::buffer(picture.jpeg), zmq::send_flags::dontwait);
+  }
 }
 
 }  // namespace booth::api

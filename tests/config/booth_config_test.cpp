@@ -160,6 +160,115 @@ TEST(ParseConfig, TakesWhatIsSet) {
   EXPECT_EQ(write_config(again.config), write_config(config));
 }
 
+constexpr const char* mixture = R"(
+      [[cameras]]
+      id = "body-00"
+      driver = "aravis"
+      address = "192.168.7.10"
+      exposure_us = 8000
+      white_balance_red = 1.5
+      trigger = "action"
+      action = 2
+      features = ["LineDebouncerTime=50", "UserSetDefault=Default=1"]
+      [[cameras]]
+      id = "face-left"
+      driver = "v4l2"
+      role = "face"
+      mount_rotation = "270"
+      bus = "usb-0000:00:14.0-2"
+      gain = 7
+      controls = ["power_line_frequency=1"]
+      [[cameras]]
+      id = "body-03"
+      driver = "replay"
+      [trigger]
+      driver = "gpio"
+      [trigger.gpio]
+      chip = "gpio-sim"
+      line = "4"
+      lights_chip = "gpio-sim"
+      lights_line = "5"
+      lit = ["body"]
+      [trigger.action]
+      group_mask = 4294967295
+      destinations = ["192.168.7.255"]
+      [projector]
+      driver = "display"
+      [projector.display]
+      width = 1024
+      height = 768
+      delay_us = 42000
+      )";
+
+TEST(ParseConfig, MixesDriversFreely) {
+  const ConfigReading reading = parse_config(mixture, "/etc/booth");
+  for (const ConfigFault& fault : reading.faults) ADD_FAILURE() << fault.to_string();
+  const BoothConfig& config = reading.config;
+  ASSERT_EQ(config.cameras.size(), 3U);
+  const auto* aravis = std::get_if<AravisCameraSettings>(&config.cameras[0].driver);
+  ASSERT_NE(aravis, nullptr);
+  EXPECT_EQ(aravis->id, "body-00");
+  EXPECT_EQ(aravis->address, "192.168.7.10");
+  EXPECT_EQ(aravis->exposure_us, 8000);
+  EXPECT_EQ(aravis->white_balance_red, 1.5);
+  EXPECT_EQ(aravis->white_balance_blue, std::nullopt);
+  EXPECT_EQ(aravis->trigger, AravisTriggerSource::action);
+  ASSERT_EQ(aravis->features.size(), 2U);
+  EXPECT_EQ(aravis->features[0].name, "LineDebouncerTime");
+  EXPECT_EQ(aravis->features[1].value, "Default=1");
+  const auto* v4l2 = std::get_if<V4l2CameraSettings>(&config.cameras[1].driver);
+  ASSERT_NE(v4l2, nullptr);
+  EXPECT_EQ(v4l2->role, CameraRole::face);
+  EXPECT_EQ(config.cameras[1].mount_rotation_deg, 270);
+  EXPECT_EQ(v4l2->gain, 7);
+  EXPECT_EQ(v4l2->controls.at("power_line_frequency"), 1);
+  EXPECT_EQ(driver_name(config.cameras[2]), "replay");
+  ASSERT_TRUE(config.trigger.gpio.lights);
+  EXPECT_EQ(config.trigger.gpio.lights->line, "5");
+  EXPECT_THAT(config.trigger.gpio.lit_roles, ElementsAre(ShotRole::body));
+  EXPECT_EQ(config.trigger.action.group_mask, 4294967295U);
+  EXPECT_EQ(config.projector.display.delay_us, 42000);
+  const auto [gige, usb] = live_cameras(config);
+  EXPECT_EQ(gige.cameras.size(), 1U);
+  EXPECT_EQ(gige.action.destinations, std::vector<std::string>{"192.168.7.255"});
+  EXPECT_EQ(usb.cameras.size(), 1U);
+
+  const ConfigReading again = parse_config(write_config(config), "/elsewhere");
+  for (const ConfigFault& fault : again.faults) ADD_FAILURE() << fault.to_string();
+  EXPECT_EQ(write_config(again.config), write_config(config));
+}
+
+TEST(ParseConfig, ChecksEveryDriversKeys) {
+  EXPECT_THAT(faults_of("[[cameras]]\nid = \"a\"\ndriver = \"v4l2\"\nserial = \"1\"\npacket_size = 1\n"),
+              ElementsAre(AllOf(HasSubstr("cameras[0].packet_size: 1, expected one of the keys id, driver"))));
+  EXPECT_THAT(faults_of("[[cameras]]\nid = \"a\"\ndriver = \"usb\"\n"),
+              ElementsAre("cameras[0].driver: \"usb\", expected one of \"replay\", \"aravis\", \"v4l2\""));
+  EXPECT_THAT(faults_of("[[cameras]]\nid = \"../x\"\n"),
+              ElementsAre(HasSubstr("cameras[0].id: \"../x\", expected an id")));
+  EXPECT_THAT(faults_of("[[cameras]]\ndriver = \"replay\"\n"), ElementsAre("cameras[0].id: missing, expected an id"));
+  EXPECT_THAT(faults_of("[[cameras]]\nid = \"a\"\n[[cameras]]\nid = \"a\"\n"),
+              ElementsAre(HasSubstr("cameras[1].id: \"a\", expected an id that no other camera has")));
+  EXPECT_THAT(faults_of("[[cameras]]\nid = \"a\"\ndriver = \"aravis\"\nserial = \"1\"\nexposure_us = 0\n"
+                        "mount_rotation = 90\nfeatures = [\"x\"]\n"),
+              ElementsAre(HasSubstr("cameras[0].mount_rotation: 90, expected one of"),
+                          HasSubstr("cameras[0].exposure_us: 0, expected 1 … 10000000"),
+                          HasSubstr("cameras[0].features: an array, expected an array of texts NAME=VALUE")));
+  EXPECT_THAT(faults_of("[[cameras]]\nid = \"a\"\ndriver = \"v4l2\"\ndevice = \"/dev/video0\"\n"
+                        "controls = [\"gain=much\"]\n"),
+              ElementsAre(HasSubstr("cameras[0].controls")));
+}
+
+TEST(ParseConfig, TriggersAndProjectorsMustFitTheCameras) {
+  const std::string usb = "[[cameras]]\nid = \"a\"\ndriver = \"v4l2\"\ndevice = \"/dev/video0\"\n";
+  EXPECT_THAT(faults_of(usb), ElementsAre("trigger.driver: \"replay\", expected another one: no camera is replayed",
+                                          HasSubstr("projector.driver: \"replay\"")));
+  EXPECT_THAT(faults_of(usb + "[trigger]\ndriver = \"none\"\n[projector]\ndriver = \"none\"\n"), IsEmpty());
+  EXPECT_THAT(faults_of(usb + "[trigger]\ndriver = \"aravis\"\n[projector]\ndriver = \"none\"\n"),
+              ElementsAre(HasSubstr("no camera has the trigger software or action")));
+  EXPECT_THAT(faults_of(usb + "[trigger]\ndriver = \"gpio\"\n[projector]\ndriver = \"none\"\n"),
+              ElementsAre(HasSubstr("trigger.gpio: ")));
+}
+
 TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
   EXPECT_THAT(
       faults_of(R"(
@@ -177,8 +286,8 @@ TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
       limit_mib = -5
       [jobs]
       workers = 2.5
-      [drivers]
-      camera = "webcam"
+      [trigger]
+      driver = "webcam"
       [replay]
       recording = 7
       faults = [{kind = "late"}, 3, {kind = "slow", index = -1, when = "now"}]
@@ -187,16 +296,19 @@ TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
       triangles = 9999999999999
       )"),
       testing::UnorderedElementsAre(
-          "colour: \"red\", expected one of the keys booth, api, capture, disk, jobs, log, drivers, replay, "
+          "colour: \"red\", expected one of the keys booth, api, capture, disk, jobs, log, cameras, trigger, "
+          "projector, replay, "
           "reconstruct, export",
           "log: 3, expected a table: [log]", "booth.name: \"\", expected a text of 1 … 64 bytes on one line",
           "capture.frame_timeout_ms: 0, expected 50 … 60000",
           "capture.min_cameras: \"many\", expected a whole number, 1 … 256",
           "capture.image_format: \"tiff\", expected one of \"png\", \"jpeg\"",
-          "capture.jpeg_qualty: 90, expected one of the keys frame_timeout_ms, min_cameras, background_frames, "
+          "capture.jpeg_qualty: 90, expected one of the keys frame_timeout_ms, retries, max_skew_ms, min_cameras, "
+          "background_frames, "
           "image_format, png_level, jpeg_quality, keep_encoded",
           "capture.keep_encoded: 1, expected true or false", "disk.limit_mib: -5, expected 0 … 100000000",
-          "jobs.workers: 2.5, expected a whole number, 1 … 64", "drivers.camera: \"webcam\", expected \"replay\"",
+          "jobs.workers: 2.5, expected a whole number, 1 … 64",
+          "trigger.driver: \"webcam\", expected one of \"replay\", \"gpio\", \"aravis\", \"none\"",
           "replay.recording: 7, expected a path", "replay.faults[1]: 3, expected a table",
           "replay.faults[2].kind: \"slow\", expected one of \"missing\", \"late\", \"corrupt\", \"lost\"",
           "replay.faults[2].index: -1, expected 0 … 1000000",

@@ -55,7 +55,9 @@ TEST_F(Methods, StatusTellsEverything) {
   EXPECT_EQ(camera["role"], "body");
   EXPECT_EQ(camera["state"], "online");
   EXPECT_TRUE(camera.at("message").is_null());
-  EXPECT_TRUE(camera.at("last_frame_age_s").is_null());
+  EXPECT_GE(camera["last_frame_age_s"], 0) << "its test frame";
+  EXPECT_EQ(camera["frames"], 0);
+  EXPECT_TRUE(camera.at("fault").is_null());
   EXPECT_EQ(status["projector"]["id"], "beamer");
   EXPECT_EQ(status["trigger"]["driver"], "replay");
   EXPECT_EQ(status["calibration"]["loaded"], true);
@@ -79,11 +81,16 @@ TEST_F(Methods, ShutdownIsAnsweredAndAskedForOnce) {
 }
 
 TEST_F(Methods, WhatIsNotOfferedYetSaysSo) {
-  for (const char* method : {"camera.discover", "background.learn", "calibration.capture", "calibration.solve",
-                             "calibration.apply", "calibration.discard"})
+  for (const char* method : {"calibration.capture", "calibration.solve", "calibration.apply", "calibration.discard"})
     EXPECT_EQ(refusal(method), "unsupported") << method;
-  EXPECT_EQ(refusal("preview.start", {{"camera", "b0"}, {"fps", 5}, {"max_width", 320}}), "unsupported");
-  EXPECT_EQ(refusal("preview.stop", {{"camera", "b0"}}), "unsupported");
+}
+
+TEST_F(Methods, TheirParametersAreChecked) {
+  EXPECT_EQ(refusal("preview.start", {{"camera", "nobody"}}), "not_found");
+  EXPECT_EQ(refusal("preview.stop", {{"camera", "nobody"}}), "not_found");
+  EXPECT_EQ(refusal("preview.stop"), "invalid_params");
+  EXPECT_EQ(refusal("background.learn", {{"frames", 101}}), "invalid_params");
+  EXPECT_EQ(refusal("camera.discover", {{"driver", "aravis"}}), "invalid_params");
   EXPECT_EQ(refusal("preview.start", {{"camera", "b0"}, {"fps", 31}}), "invalid_params");
   EXPECT_EQ(refusal("preview.start"), "invalid_params");
   EXPECT_EQ(refusal("background.learn", {{"frames", 0}}), "invalid_params");

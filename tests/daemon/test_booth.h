@@ -4,6 +4,7 @@
 #include <spdlog/spdlog.h>
 #include <sys/stat.h>
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstdlib>
@@ -169,6 +170,7 @@ class RawClient {
 struct SeenEvent {
   std::string topic;
   Json fields;
+  std::string bytes = {};  ///< of a preview: its JPEG
 };
 
 /// Hears every event from its construction on.
@@ -211,6 +213,10 @@ class Listener {
     if (!socket_.recv(topic, zmq::recv_flags::none)) return false;
     static_cast<void>(socket_.recv(fields, zmq::recv_flags::none));
     heard_.push_back({topic.to_string(), Json::parse(fields.to_string())});
+    if (!fields.more()) return true;
+    zmq::message_t picture;
+    static_cast<void>(socket_.recv(picture, zmq::recv_flags::none));
+    heard_.back().bytes = picture.to_string();
     return true;
   }
 
@@ -234,16 +240,31 @@ class TestBooth : public testing::Test {
     options_.reconstruct_command = reconstruct_.path();
   }
 
+  /// What the booth works with: as configured, unless a test has its own.
+  virtual Result<Devices> devices() { return open_devices(options_.config, clock_); }
+
   void start() {
-    auto opened = Booth::open(options_, open_devices(options_.config, clock_), clock_);
+    open();
+    ASSERT_TRUE(wait_until([&] { return all_tried() && booth_->status().not_ready.empty(); }))
+        << "the booth is not ready";
+  }
+  /// Whether each camera is online, or it is known why not.
+  bool all_tried() {
+    const auto cameras = booth_->status().cameras;
+    return std::none_of(cameras.begin(), cameras.end(),
+                        [](const CameraStatus& camera) { return camera.message == "not opened yet"; });
+  }
+  /// Without waiting until it is ready.
+  void open() {
+    auto opened = Booth::open(options_, devices(), clock());
     ASSERT_TRUE(opened) << opened.error().message;
     booth_ = std::move(*opened);
     auto server = api::Server::start(options_.config.api, *booth_, [this] { ++shutdowns_; });
     ASSERT_TRUE(server) << server.error().message;
     server_ = std::move(*server);
     client_ = std::make_unique<RawClient>(options_.config.api.control);
-    ASSERT_TRUE(wait_until([&] { return booth_->status().not_ready.empty(); })) << "the booth is not ready";
   }
+  virtual const Clock& clock() { return clock_; }
   /// As SIGTERM does.
   void stop() {
     if (booth_) booth_->drain();
