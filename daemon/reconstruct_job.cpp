@@ -16,7 +16,7 @@ using SteadyClock = std::chrono::steady_clock;
 /// Roughly how a job's time falls to its stages, so that the bar moves evenly.
 double share_of(std::string_view stage) {
   if (stage == "segmentation") return 0.25;
-  if (stage == "hull") return 0.15;
+  if (stage == "hull" || stage == "face") return 0.15;
   if (stage == "refine") return 0.1;
   if (stage == "surface") return 0.15;
   if (stage == "atlas") return 0.20;
@@ -90,7 +90,8 @@ void append(std::vector<std::string>* to, const std::vector<std::string>& from) 
 }
 
 /// The decoded shots that the reconstruction needs; what could not be used is said in `warnings`.
-Result<CaptureFrames> load_capture(const Recording& recording, const Work& work, std::vector<std::string>* warnings) {
+Result<CaptureFrames> load_capture(const Recording& recording, FaceMode face, const Work& work,
+                                   std::vector<std::string>* warnings) {
   const Shot* body = recording.find(ShotRole::body);
   if (body == nullptr) return Error{ErrorCode::no_subject, "recording.json: shots has none with the role body"};
   CaptureFrames capture;
@@ -109,6 +110,12 @@ Result<CaptureFrames> load_capture(const Recording& recording, const Work& work,
     return Error{ErrorCode::too_few_views, "no image of the body shot can be used: " + reason};
   }
   capture.body = std::move(loaded.sets.front());
+  const Shot* scan = wants_scan(face) ? recording.find(ShotRole::gray_code) : nullptr;
+  if (scan != nullptr && scan->pattern) {
+    LoadedShot patterns = load_shot(recording, *scan, work);
+    append(warnings, patterns.faults);
+    capture.face = {*scan->pattern, std::move(patterns.sets)};
+  }
   return capture;
 }
 
@@ -140,7 +147,7 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   const auto recording = read_recording(recording_folder);
   if (!recording) return recording.error();
   JobReport report;
-  auto capture = load_capture(*recording, work, &report.warnings);
+  auto capture = load_capture(*recording, options.face, work, &report.warnings);
   if (work.stopped()) return Work::cancelled();
   if (!capture) return capture.error();
 

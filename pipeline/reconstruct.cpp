@@ -6,6 +6,7 @@
 #include <span>
 #include <utility>
 
+#include "pipeline/face/field_fusion.h"
 #include "pipeline/image/develop.h"
 #include "pipeline/surface/marching_cubes.h"
 
@@ -65,6 +66,9 @@ Result<CaptureFrames> develop_all(const CaptureFrames& capture, const Work& work
   for (FrameSet& set : developed.background)
     for (Frame& frame : set.frames) frames.push_back(&frame);
   for (Frame& frame : developed.body.frames) frames.push_back(&frame);
+  if (developed.face)
+    for (FrameSet& set : developed.face->sets)
+      for (Frame& frame : set.frames) frames.push_back(&frame);
   std::vector<std::optional<Error>> faults(frames.size());
   work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end && !work.stopped(); ++i) {
@@ -117,10 +121,39 @@ Result<SegmentedViews> segment_all(const CaptureFrames& capture, std::span<const
   return views;
 }
 
-Mesh make_surface(const Field& field, const ReconstructionOptions& options, const Work& work) {
+/// The face's scan, cleaned and joined to a mesh.
+struct FaceSurface {
+  ScanMesh scan;
+  Eigen::Vector3f eye;  ///< where it was seen from, world frame
+};
+
+Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Silhouette> silhouettes,
+                              const ReconstructionOptions& options, const Work& work,
+                              std::vector<std::string>* warnings) {
+  auto scanned = scan_structured_light(capture.rig, *capture.face, silhouettes, options.structured_light, work);
+  if (!scanned) return scanned.error();
+  warnings->insert(warnings->end(), scanned->warnings.begin(), scanned->warnings.end());
+  auto meshed = mesh_scan(scanned->scan, {}, work);
+  if (!meshed) return meshed.error();
+  return FaceSurface{std::move(*meshed), scanned->eye};
+}
+
+/// The closed surface within its budget of triangles, with the face's scan where there is one that meets it.
+Mesh make_surface(const Field& field, const FaceSurface* face, const ReconstructionOptions& options, const Work& work,
+                  std::vector<std::string>* warnings) {
   Mesh mesh = extract_surface(field, work);
+  const auto head = face != nullptr ? find_head(mesh) : std::nullopt;
+  if (head && options.face_merge.method == FaceMergeMethod::sight)
+    mesh = keep_largest_part(extract_surface(fuse_scan(field, *head, face->scan, face->eye, work), work));
   mesh = smooth_hc(mesh, options.smoothing, work);
-  return decimate(mesh, options.decimation, work);
+  if (face == nullptr) return decimate(mesh, options.decimation, work);
+  auto merged = head ? merge_face(mesh, *head, face->scan, face->eye, options.face_merge, work)
+                     : Result<FaceMerge>(Error{ErrorCode::no_subject, "no head was found"});
+  if (!merged) {
+    warnings->push_back("the face is the hull's own: " + merged.error().message);
+    return decimate(mesh, options.decimation, work);
+  }
+  return decimate(merged->mesh, merged->face, options.face_share, options.decimation, work);
 }
 
 /// Skeleton and weights, or an avatar left unrigged with a warning: a shape that cannot be rigged is still worth
@@ -162,15 +195,18 @@ std::optional<FaceMode> face_mode_from(std::string_view name) {
   return std::nullopt;
 }
 
+bool wants_scan(FaceMode mode) { return mode == FaceMode::active || mode == FaceMode::automatic; }
+
 const std::vector<std::string>& reconstruction_stages() {
-  static const std::vector<std::string> stages{"segmentation", "hull",     "refine", "surface",
-                                               "atlas",        "skeleton", "skin"};
+  static const std::vector<std::string> stages{"segmentation", "hull",  "refine",   "face",
+                                               "surface",      "atlas", "skeleton", "skin"};
   return stages;
 }
 
 Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options, const Work& work,
                                    const StageProgress& progress) {
-  if (is_raw(capture.body) || std::any_of(capture.background.begin(), capture.background.end(), is_raw)) {
+  if (is_raw(capture.body) || std::any_of(capture.background.begin(), capture.background.end(), is_raw) ||
+      (capture.face && std::any_of(capture.face->sets.begin(), capture.face->sets.end(), is_raw))) {
     const auto developed = develop_all(capture, work);
     return developed ? reconstruct(*developed, options, work, progress) : developed.error();
   }
@@ -208,18 +244,31 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
     if (work.stopped()) return Work::cancelled();
   }
 
+  std::optional<FaceSurface> face;
+  {
+    const StageReport report("face", work, progress);
+    if (wants_scan(options.face) && capture.face) {
+      auto scanned = scan_face(capture, views.silhouettes, options, report.work(), &warnings);
+      if (work.stopped()) return Work::cancelled();
+      if (scanned)
+        face = std::move(*scanned);
+      else
+        warnings.push_back("the face is the hull's own: " + scanned.error().message);
+    } else if (options.face == FaceMode::active) {
+      warnings.emplace_back("the face is the hull's own: the recording has no structured-light shot");
+    } else if (options.face == FaceMode::passive) {
+      warnings.emplace_back("the face is the hull's own: refinement (passive) is not available in this version");
+    }
+  }
+
   Avatar& avatar = result.avatar;
   {
     const StageReport report("surface", work, progress);
-    avatar.mesh = make_surface(hull.field, options, report.work());
+    avatar.mesh = make_surface(hull.field, face ? &*face : nullptr, options, report.work(), &warnings);
     hull.field = {};
     if (work.stopped()) return Work::cancelled();
     if (avatar.mesh.triangles.empty()) return Error{ErrorCode::no_subject, "no surface is left after carving"};
   }
-
-  if (options.face != FaceMode::none)
-    warnings.push_back("the face is the hull's own: refinement (" + std::string(to_string(options.face)) +
-                       ") is not available in this version");
 
   {
     const StageReport report("atlas", work, progress);

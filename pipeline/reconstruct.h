@@ -7,12 +7,14 @@
 #include <vector>
 
 #include "pipeline/atlas/texture_atlas.h"
+#include "pipeline/face/face_merge.h"
 #include "pipeline/hull/visual_hull.h"
 #include "pipeline/refine/handle_removal.h"
 #include "pipeline/refine/shape_refinement.h"
 #include "pipeline/segmentation/segmentation.h"
 #include "pipeline/skeleton/skeleton_fit.h"
 #include "pipeline/skin/skinning.h"
+#include "pipeline/structured_light/structured_light.h"
 #include "pipeline/surface/decimation.h"
 #include "pipeline/surface/smoothing.h"
 #include "pipeline/types/avatar.h"
@@ -29,6 +31,9 @@ std::string_view to_string(FaceMode mode);
 /// "auto", "active", "passive" or "none".
 std::optional<FaceMode> face_mode_from(std::string_view name);
 
+/// Whether that mode makes use of a structured-light shot.
+bool wants_scan(FaceMode mode);
+
 struct ReconstructionOptions {
   FaceMode face = FaceMode::automatic;
   SegmentationOptions segmentation;
@@ -37,6 +42,9 @@ struct ReconstructionOptions {
   HandleRemovalOptions handles;
   SmoothingOptions smoothing;
   DecimationOptions decimation;
+  StructuredLightOptions structured_light;
+  FaceMergeOptions face_merge;
+  double face_share = 0.35;  ///< of decimation.triangles, for a face that was scanned, 0 … 0.9
   AtlasOptions atlas;
   SkeletonOptions skeleton;
   SkinningOptions skinning;
@@ -45,8 +53,9 @@ struct ReconstructionOptions {
 /// A capture, decoded. Raw frames (Frame::mosaic) are developed first.
 struct CaptureFrames {
   Rig rig;
-  std::vector<FrameSet> background;  ///< the empty booth, one set a repetition
-  FrameSet body;                     ///< the subject, one trigger
+  std::vector<FrameSet> background;          ///< the empty booth, one set a repetition
+  FrameSet body;                             ///< the subject, one trigger
+  std::optional<GrayCodeCapture> face = {};  ///< the face under structured light, where it was taken
 };
 
 struct Reconstruction {
@@ -61,11 +70,11 @@ const std::vector<std::string>& reconstruction_stages();
 /// Called when a stage begins (fraction 0), while it runs, and when it ends (1).
 using StageProgress = std::function<void(std::string_view stage, double fraction)>;
 
-/// The whole method: segment → hull → refine → surface → atlas → skeleton → skin.
+/// The whole method: segment → hull → refine → face → surface → atlas → skeleton → skin.
 ///
 /// @param work  its progress is not used; stages report through `progress`
 /// A camera that cannot be used is left out with a warning; a shape that cannot be rigged comes back without joints
-/// and with a warning; a face mode that this version does not offer is a warning.
+/// and with a warning; a face scan that is missing or too poor leaves the hull's face, with a warning.
 ///
 /// @error what the stages return, cancelled
 Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options,

@@ -7,6 +7,7 @@
 #include <cstdint>
 #include <limits>
 #include <numeric>
+#include <span>
 #include <vector>
 
 namespace booth {
@@ -135,22 +136,34 @@ class EdgeQueue {
 
 class Decimation {
  public:
-  Decimation(const Mesh& mesh, const Work& work) : work_(work), triangles_(mesh.triangles.size()) {
-    for (size_t t = 0; t < triangles_.size(); ++t) triangles_[t].corner = mesh.triangles[t];
+  /// @param detail  per vertex, or empty: triangles whose corners all have 1 are counted by themselves
+  Decimation(const Mesh& mesh, std::span<const uint8_t> detail, const Work& work)
+      : work_(work), triangles_(mesh.triangles.size()) {
+    for (size_t t = 0; t < triangles_.size(); ++t) {
+      const auto& corner = mesh.triangles[t];
+      triangles_[t].corner = corner;
+      const bool inside = !detail.empty() && detail[corner[0]] != 0 && detail[corner[1]] != 0 && detail[corner[2]] != 0;
+      triangles_[t].region = inside ? 1 : 0;
+      ++alive_[triangles_[t].region];
+    }
     vertices_.reserve(mesh.positions.size());
     for (const Eigen::Vector3f& p : mesh.positions) vertices_.push_back({p, {}, false});
-    alive_ = triangles_.size();
     find_twins();
     lock_unsafe_vertices();
     sum_quadrics();
   }
 
-  Mesh run(size_t budget) {
+  using Budget = std::array<size_t, 2>;  ///< of the triangles outside and inside the detail
+
+  /// @param detail_share  of the budget; what the detail cannot use goes to the rest
+  Mesh run(size_t total, double detail_share) {
+    const size_t share = std::min(alive_[1], static_cast<size_t>(detail_share * static_cast<double>(total)));
+    const Budget budget{total - share, share};
     // Where every collapse left is refused, what is asked of the triangles around it is lowered.
     for (const Guard& guard : {Guard{0.3F, 0.02F}, Guard{-0.3F, 0.002F}, Guard{-1, 1e-5F}}) {
       guard_ = guard;
-      while (alive_ > budget) {
-        const size_t before = alive_;
+      while (alive_[0] > budget[0] || alive_[1] > budget[1]) {
+        const Budget before = alive_;
         queue_all();
         collapse_until(budget);
         if (work_.stopped() || alive_ == before) break;
@@ -175,6 +188,7 @@ class Decimation {
     std::array<uint32_t, 3> corner;                  ///< {none, …} once it is gone
     std::array<uint32_t, 3> twin{none, none, none};  ///< of its half-edges
     std::array<uint16_t, 3> stamp{};  ///< of its half-edges: entries of the queue with another are out of date
+    uint8_t region = 0;               ///< which budget it counts against
   };
   struct Spanned {
     Eigen::Vector3f normal;  ///< twice the area long
@@ -279,14 +293,19 @@ class Decimation {
       if (!dead(half) && half < twin(half)) queue(half);
   }
 
-  void collapse_until(size_t budget) {
+  void collapse_until(const Budget& budget) {
+    const auto wanted = [&](uint32_t half) {
+      const uint8_t region = triangles_[half / 3].region;
+      return alive_[region] > budget[region];
+    };
     EdgeQueue::Entry entry{};
     size_t bucket = 0;
     constexpr size_t between_looks = 4096;  // edges between two looks at the stop token
-    for (size_t pops = 0; alive_ > budget && queue_.pop(entry, bucket); ++pops) {
+    for (size_t pops = 0; (alive_[0] > budget[0] || alive_[1] > budget[1]) && queue_.pop(entry, bucket); ++pops) {
       if (pops % between_looks == 0 && work_.stopped()) return;
       const uint32_t half = entry.half;
       if (dead(half) || triangles_[half / 3].stamp[half % 3] != entry.stamp) continue;
+      if (!wanted(half) || !wanted(twin(half))) continue;  // its region has reached its budget
       // A collapse only raises the costs around it, so that they need not be known before their old value is up.
       const Quadric q = edge_quadric(half);
       const Inverse inverse(q);
@@ -368,9 +387,9 @@ class Decimation {
       triangles_[a / 3].twin[a % 3] = b;
       triangles_[b / 3].twin[b % 3] = a;
       triangles_[edge / 3].corner = {none, none, none};
+      --alive_[triangles_[edge / 3].region];
       joined[count++] = a;
     }
-    alive_ -= 2;
     Quadric q = vertices_[v].quadric;
     q.move_origin(vertices_[u].position - vertices_[v].position);
     q.add(vertices_[u].quadric);
@@ -401,7 +420,7 @@ class Decimation {
   std::vector<Triangle> triangles_;
   std::vector<Vertex> vertices_;
   EdgeQueue queue_;
-  size_t alive_ = 0;
+  Budget alive_{0, 0};
   Guard guard_{};
   std::vector<uint32_t> ring_, moved_;
   std::vector<Spanned> fan_;
@@ -411,7 +430,13 @@ class Decimation {
 
 Mesh decimate(const Mesh& mesh, const DecimationOptions& options, const Work& work) {
   if (mesh.triangles.size() <= options.triangles) return mesh;
-  return Decimation(mesh, work).run(options.triangles);
+  return Decimation(mesh, {}, work).run(options.triangles, 0);
+}
+
+Mesh decimate(const Mesh& mesh, std::span<const uint8_t> detail, double detail_share, const DecimationOptions& options,
+              const Work& work) {
+  if (mesh.triangles.size() <= options.triangles) return mesh;
+  return Decimation(mesh, detail, work).run(options.triangles, detail_share);
 }
 
 }  // namespace booth

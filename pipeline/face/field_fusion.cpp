@@ -1,0 +1,160 @@
+#include "pipeline/face/field_fusion.h"
+
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <vector>
+
+#include "pipeline/face/ray_caster.h"
+
+namespace booth {
+namespace {
+
+constexpr int side = Field::brick_side;
+
+/// How deep the scan's surface lies beyond a point, along the ray from the eye; negative where it lies before it.
+class ScanDepth {
+ public:
+  ScanDepth(const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye)
+      : head_(head), scan_(scan), eye_(eye), rays_(scan.mesh) {}
+
+  /// What a ray meets of the scan.
+  struct Depth {
+    float distance = -std::numeric_limits<float>::infinity();  ///< metres from the surface, positive towards the eye
+    float cosine = 0;                                          ///< of the angle at which the ray meets the surface
+    float rim_m = 0;                                           ///< how far from the scan's rim
+  };
+  /// −infinity where the scan says nothing.
+  Depth at(const Eigen::Vector3f& p) const {
+    if (p.y() < head_.lowest_face_y()) return {};
+    const Eigen::Vector3f way = (p - eye_).normalized();
+    const auto hit = rays_.cast(eye_, way, 0, std::numeric_limits<float>::infinity());
+    if (!hit) return {};
+    const auto& corner = scan_.mesh.triangles[hit->triangle];
+    const auto& points = scan_.mesh.positions;
+    const Eigen::Vector3f normal =
+        (points[corner[1]] - points[corner[0]]).cross(points[corner[2]] - points[corner[0]]).normalized();
+    const float rim = std::min({scan_.rim_m[corner[0]], scan_.rim_m[corner[1]], scan_.rim_m[corner[2]]});
+    constexpr float slope = 3, deepest_m = 0.03F;
+    const float held_back = std::max(0.0F, deepest_m - slope * rim);
+    constexpr float least_cosine = 0.2F;
+    const float cosine = std::max(least_cosine, std::abs(normal.dot(way)));
+    return {(hit->distance_m - held_back - (p - eye_).norm()) * cosine, cosine, rim};
+  }
+
+ private:
+  const HeadRegion& head_;
+  const ScanMesh& scan_;
+  Eigen::Vector3f eye_;
+  RayCaster rays_;
+};
+
+}  // namespace
+
+Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye,
+                const Work& work) {
+  if (scan.mesh.triangles.empty()) return field;
+  const ScanDepth depth(head, scan, eye);
+  const Grid& grid = field.grid();
+  const float cut_off = 2 * static_cast<float>(grid.voxel_m);
+  Eigen::AlignedBox3f box;
+  for (const auto& triangle : scan.mesh.triangles)
+    for (const uint32_t v : triangle)
+      if (scan.mesh.positions[v].y() > head.lowest_face_y()) box.extend(scan.mesh.positions[v]);
+
+  // New samples of the bricks between eye and scan, and what each brick is then.
+  const auto [nx, ny, nz] = field.bricks();
+  std::vector<std::vector<float>> carved(static_cast<size_t>(nx) * static_cast<size_t>(ny) * static_cast<size_t>(nz));
+  work.parallel_for(static_cast<size_t>(nz) * static_cast<size_t>(ny), 1, [&](size_t begin, size_t end) {
+    for (size_t row = begin; row < end && !work.stopped(); ++row) {
+      const int by = static_cast<int>(row) % ny, bz = static_cast<int>(row) / ny;
+      for (int bx = 0; bx < nx; ++bx) {
+        const size_t brick = field.brick_index(bx, by, bz);
+        if (field.brick(brick) == Field::all_outside) continue;
+        const Eigen::Vector3f low = grid.point(bx * side, by * side, bz * side).cast<float>();
+        const Eigen::Vector3f high = low + Eigen::Vector3f::Constant(static_cast<float>(side * grid.voxel_m));
+        // Only the front half of the head can lie before the scan: what the scan's box, reaching towards the eye,
+        // holds.
+        Eigen::AlignedBox3f reach = box;
+        constexpr float hull_excess_m = 0.08F;
+        const Eigen::Vector3f towards = (eye - box.center()).normalized() * hull_excess_m;
+        reach.extend(box.min() + towards);
+        reach.extend(box.max() + towards);
+        if (!reach.intersects(Eigen::AlignedBox3f(low, high))) continue;
+        std::vector<float> samples(Field::samples_per_brick);
+        bool changed = false;
+        size_t s = 0;
+        for (int z = 0; z < side; ++z)
+          for (int y = 0; y < side; ++y)
+            for (int x = 0; x < side; ++x, ++s) {
+              const int i = bx * side + x, j = by * side + y, k = bz * side + z;
+              const bool beyond = i >= grid.size[0] || j >= grid.size[1] || k >= grid.size[2];
+              const int32_t block = field.brick(brick);
+              const float before = block == Field::all_inside ? -cut_off : field.block(block)[s];
+              samples[s] = before;
+              if (beyond || before >= cut_off) continue;
+              const auto [distance, cosine, rim] = depth.at(grid.point(i, j, k).cast<float>());
+              constexpr float thickest_fill_m = 0.012F, fill_from_rim_m = 0.005F, steepest_fill = 0.4F;
+              const bool fills = distance < 0 && distance > -thickest_fill_m && rim > fill_from_rim_m &&
+                                 cosine > steepest_fill && before > distance;
+              if (distance <= before && !fills) continue;
+              samples[s] = std::min(distance, cut_off);
+              changed = true;
+            }
+        if (changed) carved[brick] = std::move(samples);
+      }
+    }
+  });
+
+  Field out(grid);
+  size_t blocks = 0;
+  for (size_t brick = 0; brick < carved.size(); ++brick)
+    if (!carved[brick].empty() || field.brick(brick) >= 0) ++blocks;
+  out.allocate_blocks(blocks);
+  int32_t next = 0;
+  for (size_t brick = 0; brick < carved.size(); ++brick) {
+    if (!carved[brick].empty()) {
+      std::copy(carved[brick].begin(), carved[brick].end(), out.block(next));
+    } else if (field.brick(brick) >= 0) {
+      std::copy_n(field.block(field.brick(brick)), Field::samples_per_brick, out.block(next));
+    } else {
+      out.set_brick(brick, field.brick(brick));
+      continue;
+    }
+    out.set_brick(brick, next++);
+  }
+  return out;
+}
+
+Mesh keep_largest_part(const Mesh& mesh) {
+  std::vector<uint32_t> parent(mesh.positions.size());
+  std::iota(parent.begin(), parent.end(), 0U);
+  const auto find = [&](uint32_t v) {
+    while (parent[v] != v) v = parent[v] = parent[parent[v]];
+    return v;
+  };
+  for (const auto& [a, b, c] : mesh.triangles) {
+    parent[find(b)] = find(a);
+    parent[find(c)] = find(a);
+  }
+  std::vector<double> area(mesh.positions.size(), 0);
+  for (const auto& [a, b, c] : mesh.triangles)
+    area[find(a)] += static_cast<double>(
+        (mesh.positions[b] - mesh.positions[a]).cross(mesh.positions[c] - mesh.positions[a]).norm());
+  const auto largest = static_cast<uint32_t>(std::max_element(area.begin(), area.end()) - area.begin());
+  Mesh kept;
+  std::vector<uint32_t> renamed(mesh.positions.size(), 0);
+  for (uint32_t v = 0; v < mesh.positions.size(); ++v)
+    if (find(v) == largest) {
+      renamed[v] = static_cast<uint32_t>(kept.positions.size());
+      kept.positions.push_back(mesh.positions[v]);
+    }
+  for (const auto& [a, b, c] : mesh.triangles)
+    if (find(a) == largest) kept.triangles.push_back({renamed[a], renamed[b], renamed[c]});
+  return kept;
+}
+
+}  // namespace booth

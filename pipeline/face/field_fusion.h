@@ -1,0 +1,31 @@
+#pragma once
+
+#include <Eigen/Core>
+
+#include "pipeline/face/head.h"
+#include "pipeline/face/scan_mesh.h"
+#include "pipeline/types/field.h"
+#include "pipeline/types/mesh.h"
+#include "pipeline/types/work.h"
+
+namespace booth {
+
+/// Puts the scan's surface into a hull's field. What lies between the scan's eye and its surface goes away; what lies a
+/// little behind the surface and was outside, because a silhouette cut too deep, is filled. Folds that the hull has in
+/// front of the scan, which no displacement of a mesh could undo, are gone before there is a mesh.
+///
+/// Towards the scan's rim it cuts ever shallower, so that it leaves a slope and no step; there it fills nothing.
+///
+/// @param field  as carve_visual_hull returns it
+/// @param eye    world frame, metres: where the scan was seen from
+/// @return the field with the scan's surface in it to about a tenth of a voxel, metres where stored. Its zero level may
+///         have closed-off cavities; keep_largest_part drops their surface
+/// Source: Y. Yemez, C. Wetherilt, "A volumetric fusion technique for surface reconstruction from silhouettes and range
+/// data", CVIU 105(1), 2007.
+Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye,
+                const Work& work = {});
+
+/// The connected part of a mesh with the largest area.
+Mesh keep_largest_part(const Mesh& mesh);
+
+}  // namespace booth

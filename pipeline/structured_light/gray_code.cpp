@@ -1,0 +1,586 @@
+#include "pipeline/structured_light/gray_code.h"
+
+#include <Eigen/Cholesky>
+#include <Eigen/Core>
+#include <Eigen/LU>
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <cmath>
+#include <limits>
+#include <numbers>
+#include <numeric>
+#include <optional>
+
+namespace booth {
+namespace {
+
+constexpr float nan = std::numeric_limits<float>::quiet_NaN();
+constexpr int fine_bits = 4;      // the finest bits' differences are kept to place a pixel between the stripes' edges
+constexpr int steps_per_px = 8;   // of the search for the position, projector pixels
+constexpr int search_steps = 12;  // to each side of the integer position: a bit read wrongly at an edge moves it by one
+constexpr size_t row_grain = 16;  // rows in a piece of parallel work
+constexpr int fewest_lit = 200;   // pixels below which there is nothing to decode
+
+/// One bit of a coordinate: the images that show it.
+struct BitImages {
+  const Image* pattern = nullptr;
+  const Image* inverse = nullptr;
+  bool complete() const { return pattern != nullptr && inverse != nullptr; }
+  bool missing() const { return pattern == nullptr && inverse == nullptr; }
+};
+
+/// The sequence, sorted by what each image shows. Bits from the most significant.
+struct Sequence {
+  int width = 0, height = 0;
+  std::vector<Image> converted;                ///< grey copies of colour images
+  std::array<std::vector<BitImages>, 2> bits;  ///< of columns, of rows
+  const Image* white = nullptr;
+  const Image* black = nullptr;
+};
+
+int bits_for(int size) { return std::bit_width(static_cast<unsigned>(std::max(size, 2) - 1)); }
+
+Image to_grey(const Image& image) {
+  Image grey(image.width, image.height, 1);
+  const size_t channels = static_cast<size_t>(image.channels);
+  for (size_t i = 0; i < grey.samples.size(); ++i) {
+    const uint8_t* p = image.samples.data() + i * channels;
+    grey.samples[i] = static_cast<uint8_t>((p[0] + 2 * p[1] + p[2] + 2) / 4);  // green sees most of a projector's light
+  }
+  return grey;
+}
+
+Result<Sequence> sort_images(std::span<const Frame> frames, const GrayCodePattern& pattern) {
+  if (!pattern.columns || !pattern.rows)
+    return Error{ErrorCode::unsupported, "the Gray-code sequence has no patterns for both columns and rows"};
+  if (frames.empty()) return Error{ErrorCode::no_subject, "the Gray-code sequence has no images"};
+  Sequence sequence;
+  sequence.converted.reserve(frames.size());
+  std::vector<const Image*> shown(static_cast<size_t>(pattern_count(pattern)), nullptr);
+  for (const Frame& frame : frames) {
+    if (frame.index < 0 || static_cast<size_t>(frame.index) >= shown.size()) continue;
+    const Image* image = frame.pixels.get();
+    if (sequence.width == 0) {
+      sequence.width = image->width;
+      sequence.height = image->height;
+    }
+    if (image->width != sequence.width || image->height != sequence.height)
+      return Error{ErrorCode::invalid_argument, "camera " + frame.camera + ": image " + std::to_string(frame.index) +
+                                                    " of the Gray-code sequence has another size than the others"};
+    if (image->channels != 1) image = &sequence.converted.emplace_back(to_grey(*image));
+    shown[static_cast<size_t>(frame.index)] = image;
+  }
+  size_t next = 0;
+  const std::array<int, 2> sizes{pattern.width, pattern.height};
+  for (size_t axis = 0; axis < 2; ++axis)
+    for (int bit = 0; bit < bits_for(sizes[axis]); ++bit) {
+      BitImages images{shown[next++], nullptr};
+      if (pattern.inverse) images.inverse = shown[next++];
+      sequence.bits[axis].push_back(images);
+    }
+  sequence.white = shown[next++];
+  sequence.black = shown[next];
+  return sequence;
+}
+
+/// A pattern that was not projected when its image was taken (the projector did not step, or an image stands twice in
+/// the sequence) shows in the sum with its inverse, which is the same for all bits.
+void drop_contradicting(Sequence* sequence, const std::string& camera, std::vector<std::string>* warnings) {
+  constexpr int stride = 8;                // every eighth pixel of every eighth row tells enough
+  constexpr double tolerated_share = 0.3;  // of the lit pixels
+  if (sequence->white == nullptr || sequence->black == nullptr) return;
+  for (size_t axis = 0; axis < 2; ++axis)
+    for (size_t bit = 0; bit < sequence->bits[axis].size(); ++bit) {
+      BitImages& images = sequence->bits[axis][bit];
+      if (!images.complete()) continue;
+      size_t lit = 0, contradicting = 0;
+      for (int y = 0; y < sequence->height; y += stride)
+        for (int x = 0; x < sequence->width; x += stride) {
+          const int white = sequence->white->at(x, y), black = sequence->black->at(x, y);
+          constexpr int clearly_lit = 16;
+          if (white - black < clearly_lit) continue;
+          ++lit;
+          const int sum = images.pattern->at(x, y) + images.inverse->at(x, y);
+          if (2 * std::abs(sum - white - black) > white - black) ++contradicting;
+        }
+      if (lit == 0 || static_cast<double>(contradicting) < tolerated_share * static_cast<double>(lit)) continue;
+      images = {};
+      warnings->push_back("camera " + camera + ": the images of " + (axis == 0 ? "column" : "row") + " bit " +
+                          std::to_string(bit) + " contradict the others and were left out");
+    }
+}
+
+/// The finest bits' difference relative to the contrast, by position: a square wave that the optics blur.
+class StripeProfiles {
+ public:
+  explicit StripeProfiles(double blur_px) {
+    for (int k = 0; k < fine_bits; ++k) {
+      std::vector<float>& table = tables_[static_cast<size_t>(k)];
+      const int period = period_px(k);
+      table.resize(static_cast<size_t>(period * steps_per_px));
+      for (size_t i = 0; i < table.size(); ++i)
+        table[i] = static_cast<float>(value(k, static_cast<double>(i) / steps_per_px, blur_px));
+    }
+  }
+  static int period_px(int k) { return 4 << k; }
+  float at(int k, int step) const {  // step counts from the centre of projector pixel 0
+    const std::vector<float>& table = tables_[static_cast<size_t>(k)];
+    return table[static_cast<size_t>(step) & (table.size() - 1)];
+  }
+  /// Mean of the finest bit's absolute value: how the blur is measured.
+  static double mean_absolute(double blur_px) {
+    const StripeProfiles profiles(blur_px);
+    double sum = 0;
+    for (const float v : profiles.tables_[0]) sum += std::abs(v);
+    return sum / static_cast<double>(profiles.tables_[0].size());
+  }
+
+ private:
+  /// Bit k of the Gray code is set in the middle half of every period, from a quarter of it less half a pixel on: the
+  /// sum of the square wave's harmonics, each damped by the Gaussian blur.
+  static double value(int k, double x, double blur_px) {
+    const double period = period_px(k);
+    const double phase = 2 * std::numbers::pi * (x + 0.5) / period;
+    constexpr int harmonics = 41;
+    double sum = 0, sign = -1;
+    for (int n = 1; n <= harmonics; n += 2, sign = -sign) {
+      const double damped = n * 2 * std::numbers::pi * blur_px / period;
+      sum += sign * 4 / (std::numbers::pi * n) * std::cos(n * phase) * std::exp(-0.5 * damped * damped);
+    }
+    return sum;
+  }
+  std::array<std::vector<float>, fine_bits> tables_;
+};
+
+/// The blur at which the finest stripes have the mean strength that was measured.
+double blur_of(double mean_absolute) {
+  double low = 0.05, high = 3.0;
+  for (int i = 0; i < 20; ++i) {
+    const double middle = 0.5 * (low + high);
+    (StripeProfiles::mean_absolute(middle) > mean_absolute ? low : high) = middle;
+  }
+  return 0.5 * (low + high);
+}
+
+/// What the first pass leaves of a lit pixel along one axis.
+struct Reading {
+  uint16_t integer = 0;                    ///< projector pixel by the signs of all bits
+  std::array<int8_t, fine_bits> relative;  ///< differences of the finest bits, 100 = the contrast
+};
+constexpr float relative_unit = 100;
+
+struct LitPixel {
+  uint16_t x = 0;
+  float contrast = 0;
+  std::array<Reading, 2> axis;
+};
+
+class Decoder {
+ public:
+  Decoder(const Sequence& sequence, const GrayCodePattern& pattern, const Image* subject,
+          const GrayCodeOptions& options, const Work& work)
+      : s_(sequence), work_(work), options_(options), sizes_{pattern.width, pattern.height} {
+    if (subject != nullptr) mark_tiles(*subject);
+    for (size_t axis = 0; axis < 2; ++axis)
+      for (const BitImages& bit : s_.bits[axis]) complete_ += bit.complete() ? 1 : 0;
+  }
+
+  Result<void> run(ProjectorCoordinates* out) {
+    if (const auto usable = check_bits(); !usable) return usable;
+    measure_noise(out);
+    rows_.resize(static_cast<size_t>(s_.height));
+    work_.parallel_for(rows_.size(), row_grain, [&](size_t begin, size_t end) {
+      RowBuffers buffers(static_cast<size_t>(s_.width));
+      for (size_t y = begin; y < end && !work_.stopped(); ++y) read_row(static_cast<int>(y), &buffers);
+    });
+    if (work_.stopped()) return Work::cancelled();
+    size_t lit = 0;
+    for (const auto& row : rows_) lit += row.size();
+    if (lit < fewest_lit) return Error{ErrorCode::no_subject, "hardly any pixel is lit by the projector"};
+
+    const std::array<StripeProfiles, 2> profiles{StripeProfiles(measure_blur(0)), StripeProfiles(measure_blur(1))};
+    out->blur_px = blur_;
+    raw_ = FloatImage(s_.width, s_.height, 2, nan);
+    weight_ = FloatImage(s_.width, s_.height, 1, 0);
+    out->position = FloatImage(s_.width, s_.height, 2, nan);
+    out->sigma = FloatImage(s_.width, s_.height, 2, std::numeric_limits<float>::infinity());
+    work_.parallel_for(rows_.size(), row_grain, [&](size_t begin, size_t end) {
+      for (size_t y = begin; y < end && !work_.stopped(); ++y) place_row(static_cast<int>(y), profiles);
+    });
+    measure_scale();
+    work_.parallel_for(rows_.size(), row_grain, [&](size_t begin, size_t end) {
+      for (size_t y = begin; y < end && !work_.stopped(); ++y) fit_row(static_cast<int>(y), out);
+    });
+    if (work_.stopped()) return Work::cancelled();
+    for (size_t i = 0; i < out->position.samples.size(); i += 2)
+      if (!std::isnan(out->position.samples[i])) ++out->decoded;
+    return {};
+  }
+
+ private:
+  struct RowBuffers {
+    explicit RowBuffers(size_t width) : lit(width), sum(width), strength(width) {}
+    std::vector<uint16_t> lit;
+    std::vector<int16_t> sum;       ///< white + black, or pattern + inverse
+    std::vector<int32_t> strength;  ///< sum of the absolute differences of the coarse bits
+  };
+
+  /// Tiles of the image in or near the subject; the margin leaves room for its movement since it was segmented.
+  void mark_tiles(const Image& subject) {
+    constexpr int margin = 3;  // tiles
+    const int columns = tile_of(s_.width - 1) + 1, rows = tile_of(s_.height - 1) + 1;
+    Image near(columns, rows, 1);
+    for (int y = 0; y < s_.height; ++y)
+      for (int x = 0; x < s_.width; ++x)
+        if (subject.at(x, y) >= 128) near.at(tile_of(x), tile_of(y)) = 1;
+    tiles_ = Image(columns, rows, 1);
+    for (int y = 0; y < rows; ++y)
+      for (int x = 0; x < columns; ++x)
+        if (near.at(x, y) != 0)
+          for (int v = std::max(0, y - margin); v <= std::min(rows - 1, y + margin); ++v)
+            for (int u = std::max(0, x - margin); u <= std::min(columns - 1, x + margin); ++u) tiles_.at(u, v) = 1;
+  }
+  static int tile_of(int pixel) { return pixel / 8; }
+
+  Result<void> check_bits() const {
+    const bool reference = s_.white != nullptr && s_.black != nullptr;
+    if (!reference && complete_ == 0)
+      return Error{ErrorCode::no_subject, "neither the lit and the unlit image nor any inverse of a pattern is there"};
+    for (size_t axis = 0; axis < 2; ++axis)
+      for (size_t bit = 0; bit + 1 < s_.bits[axis].size(); ++bit)
+        if (s_.bits[axis][bit].missing())
+          return Error{ErrorCode::no_subject, std::string("both images of ") + (axis == 0 ? "column" : "row") +
+                                                  " bit " + std::to_string(bit) + " are missing"};
+    return {};
+  }
+
+  /// The brightness that a pattern alone is compared with, doubled.
+  void sum_row(int y, int16_t* sum) const {
+    const auto add = [&](const Image& a, const Image& b) {
+      const uint8_t *pa = a.pixel(0, y), *pb = b.pixel(0, y);
+      for (int x = 0; x < s_.width; ++x) sum[x] = static_cast<int16_t>(pa[x] + pb[x]);
+    };
+    if (s_.white != nullptr && s_.black != nullptr) return add(*s_.white, *s_.black);
+    for (const auto& bits : s_.bits)
+      for (const BitImages& bit : bits)
+        if (bit.complete()) return add(*bit.pattern, *bit.inverse);
+  }
+
+  /// A bit's difference at a pixel: twice what its images are from the mean of lit and unlit where one is missing.
+  static int difference(const BitImages& bit, size_t i, int sum) {
+    if (bit.complete()) return bit.pattern->samples[i] - bit.inverse->samples[i];
+    if (bit.pattern != nullptr) return 2 * bit.pattern->samples[i] - sum;
+    if (bit.inverse != nullptr) return sum - 2 * bit.inverse->samples[i];
+    return 0;
+  }
+
+  /// Noise: how much the sums of pattern and inverse differ. Motion: the shift of the image that explains best how
+  /// these sums change, by least squares over the lit pixels (B. Lucas, T. Kanade, 1981).
+  void measure_noise(ProjectorCoordinates* out) {
+    std::vector<const BitImages*> pairs;
+    for (const auto& bits : s_.bits)
+      for (const BitImages& bit : bits)
+        if (bit.complete()) pairs.push_back(&bit);
+    constexpr double assumed_noise = 2;  // grey levels, where it cannot be measured
+    out->noise = noise_ = assumed_noise;
+    if (pairs.size() < 2) return;
+    constexpr int stride = 4;
+    const BitImages& first = *pairs.front();
+    std::vector<Eigen::Vector2d> moments(pairs.size(), Eigen::Vector2d::Zero());
+    Eigen::Matrix2d structure = Eigen::Matrix2d::Zero();
+    std::vector<int> spread;
+    for (int y = stride; y + 1 < s_.height; y += stride)
+      for (int x = stride; x + 1 < s_.width; x += stride) {
+        const size_t i = static_cast<size_t>(y) * static_cast<size_t>(s_.width) + static_cast<size_t>(x);
+        constexpr int clearly_lit = 12;
+        if (std::abs(difference(first, i, 0)) < clearly_lit) continue;
+        const auto sum = [](const BitImages& pair, size_t at) {
+          return pair.pattern->samples[at] + pair.inverse->samples[at];
+        };
+        const size_t down = static_cast<size_t>(s_.width);
+        const Eigen::Vector2d gradient(0.5 * (sum(first, i + 1) - sum(first, i - 1)),
+                                       0.5 * (sum(first, i + down) - sum(first, i - down)));
+        structure += gradient * gradient.transpose();
+        for (size_t p = 1; p < pairs.size(); ++p) {
+          const int change = sum(*pairs[p], i) - sum(first, i);
+          moments[p] -= change * gradient;
+          if (p % 4 == 1) spread.push_back(std::abs(change));
+        }
+      }
+    if (spread.size() < fewest_lit) return;
+    const auto middle = spread.begin() + static_cast<std::ptrdiff_t>(spread.size() / 2);
+    std::nth_element(spread.begin(), middle, spread.end());
+    constexpr double normal_mad = 0.6745;
+    constexpr double images_in_change = 4;
+    out->noise = noise_ = std::max(0.3, (*middle + 0.5) / normal_mad / std::sqrt(images_in_change));
+    structure.diagonal().array() += 1;
+    for (const Eigen::Vector2d& moment : moments)
+      out->motion_px = std::max(out->motion_px, structure.ldlt().solve(moment).norm());
+  }
+
+  void read_row(int y, RowBuffers* buffers) {
+    const size_t width = static_cast<size_t>(s_.width);
+    const size_t row = static_cast<size_t>(y) * width;
+    sum_row(y, buffers->sum.data());
+    // Lit where the coarse bits of both axes say so together: their mean difference is steadier than white minus black.
+    int coarse = 0;
+    std::fill(buffers->strength.begin(), buffers->strength.end(), 0);
+    for (const auto& bits : s_.bits)
+      for (size_t bit = 0; bit + fine_bits <= bits.size(); ++bit) {
+        const BitImages& images = bits[bit];
+        if (!images.complete()) continue;
+        ++coarse;
+        const uint8_t *p = images.pattern->samples.data() + row, *q = images.inverse->samples.data() + row;
+        for (size_t x = 0; x < width; ++x) buffers->strength[x] += std::abs(p[x] - q[x]);
+      }
+    if (s_.white != nullptr && s_.black != nullptr) {
+      ++coarse;
+      const uint8_t *p = s_.white->samples.data() + row, *q = s_.black->samples.data() + row;
+      for (size_t x = 0; x < width; ++x) buffers->strength[x] += std::abs(p[x] - q[x]);
+    }
+    const float least =
+        static_cast<float>(std::max(options_.min_contrast, options_.min_snr * noise_ * std::numbers::sqrt2));
+    const auto threshold = static_cast<int32_t>(std::ceil(least * static_cast<float>(coarse)));
+    size_t lit = 0;
+    for (size_t x = 0; x < width; ++x) {
+      buffers->lit[lit] = static_cast<uint16_t>(x);
+      const bool near = tiles_.empty() || tiles_.at(tile_of(static_cast<int>(x)), tile_of(y)) != 0;
+      lit += near && buffers->strength[x] >= threshold ? 1 : 0;
+    }
+    std::vector<LitPixel>& pixels = rows_[static_cast<size_t>(y)];
+    pixels.resize(lit);
+    for (size_t i = 0; i < lit; ++i) {
+      const size_t x = buffers->lit[i];
+      pixels[i].x = buffers->lit[i];
+      pixels[i].contrast = static_cast<float>(buffers->strength[x]) / static_cast<float>(coarse);
+    }
+    for (size_t axis = 0; axis < 2; ++axis) {
+      const auto& bits = s_.bits[axis];
+      for (size_t i = 0; i < lit; ++i) {
+        LitPixel& pixel = pixels[i];
+        const size_t at = row + pixel.x;
+        const int sum = buffers->sum[pixel.x];
+        const float scale = relative_unit / pixel.contrast;
+        unsigned value = 0, previous = 0;
+        for (size_t bit = 0; bit < bits.size(); ++bit) {
+          const int d = difference(bits[bit], at, sum);
+          previous ^= d > 0 ? 1U : 0U;  // a Gray bit is the binary bit's change from the one before it
+          value = value << 1 | previous;
+          if (bit + fine_bits >= bits.size())
+            pixel.axis[axis].relative[bits.size() - 1 - bit] =
+                static_cast<int8_t>(std::clamp(static_cast<float>(d) * scale, -127.0F, 127.0F));
+        }
+        pixel.axis[axis].integer = static_cast<uint16_t>(value);
+      }
+    }
+  }
+
+  double measure_blur(size_t axis) {
+    if (s_.bits[axis].back().missing()) return blur_;
+    double sum = 0, count = 0;
+    for (const auto& row : rows_)
+      for (const LitPixel& pixel : row)
+        if (pixel.contrast > 4 * noise_) {
+          sum += std::abs(pixel.axis[axis].relative[0]) / relative_unit;
+          ++count;
+        }
+    constexpr double usual_blur = 0.6;
+    blur_ = count > 0 ? blur_of(sum / count) : usual_blur;
+    return blur_;
+  }
+
+  void place_row(int y, const std::array<StripeProfiles, 2>& profiles) {
+    for (const LitPixel& pixel : rows_[static_cast<size_t>(y)]) {
+      std::array<float, 2> position{};
+      float information = std::numeric_limits<float>::infinity();
+      bool good = true;
+      for (size_t axis = 0; axis < 2 && good; ++axis) {
+        float found_information = 0;
+        position[axis] = place(pixel.axis[axis], axis, profiles[axis], &found_information);
+        good = position[axis] > -0.5F && position[axis] < static_cast<float>(sizes_[axis]) - 0.5F;
+        information = std::min(information, found_information);
+      }
+      if (!good) continue;
+      raw_.at(pixel.x, y, 0) = position[0];
+      raw_.at(pixel.x, y, 1) = position[1];
+      weight_.at(pixel.x, y) = information * pixel.contrast * pixel.contrast;
+    }
+  }
+
+  /// The position near the integer one at which the profiles explain the finest differences best.
+  float place(const Reading& reading, size_t axis, const StripeProfiles& profiles, float* information) const {
+    constexpr int candidates = 2 * search_steps + 1;
+    std::array<float, candidates> cost{};
+    const int center = reading.integer * steps_per_px;
+    const auto& bits = s_.bits[axis];
+    const int used = std::min(fine_bits, static_cast<int>(bits.size()));
+    for (int k = 0; k < used; ++k) {
+      if (bits[bits.size() - 1 - static_cast<size_t>(k)].missing()) continue;
+      const float measured = static_cast<float>(reading.relative[static_cast<size_t>(k)]) / relative_unit;
+      // One bit off is one outlier, not four times its weight.
+      constexpr float most = 0.5F;
+      for (int j = 0; j < candidates; ++j) {
+        const float off = measured - profiles.at(k, center + j - search_steps);
+        cost[static_cast<size_t>(j)] += std::min(off * off, most);
+      }
+    }
+    int best = 1;
+    for (int j = 1; j + 1 < candidates; ++j)
+      if (cost[static_cast<size_t>(j)] < cost[static_cast<size_t>(best)]) best = j;
+    const float before = cost[static_cast<size_t>(best - 1)], at = cost[static_cast<size_t>(best)],
+                after = cost[static_cast<size_t>(best + 1)];
+    const float bend = before - 2 * at + after;
+    const float shift = bend > 1e-6F ? std::clamp(0.5F * (before - after) / bend, -0.5F, 0.5F) : 0.0F;
+    constexpr float least_bend = 0.002F;  // in the middle of a wide stripe nothing says where
+    *information = std::max(bend, least_bend) * steps_per_px * steps_per_px * 0.5F;
+    return (static_cast<float>(center + best - search_steps) + shift) / steps_per_px;
+  }
+
+  /// How many projector pixels a camera pixel covers, along the image's rows and columns: the median step.
+  void measure_scale() {
+    std::vector<float> steps;
+    constexpr int stride = 3;
+    for (int y = 0; y < s_.height; y += stride)
+      for (int x = 0; x + 1 < s_.width; x += stride) {
+        const Eigen::Map<const Eigen::Vector2f> a(raw_.pixel(x, y)), b(raw_.pixel(x + 1, y));
+        if (a.x() == a.x() && b.x() == b.x()) steps.push_back((b - a).norm());
+      }
+    scale_ = 1;
+    if (steps.empty()) return;
+    const auto middle = steps.begin() + static_cast<std::ptrdiff_t>(steps.size() / 2);
+    std::nth_element(steps.begin(), middle, steps.end());
+    constexpr float least = 0.1F, most = 4;
+    scale_ = std::clamp(*middle, least, most);
+    constexpr float stripes_wanted = 2.5F;  // a window this wide, in projector pixels, holds edges of every direction
+    constexpr int widest = 6;
+    radius_ = std::clamp(static_cast<int>(std::lround(0.5F * stripes_wanted / scale_)), 2, widest);
+  }
+
+  /// Calls `visit` with (u, v, position) of every pixel decoded around (x, y), itself included.
+  template <class Visitor>
+  void for_each_around(int x, int y, const Visitor& visit) const {
+    for (int v = std::max(-radius_, -y); v <= radius_ && y + v < s_.height; ++v)
+      for (int u = std::max(-radius_, -x); u <= radius_ && x + u < s_.width; ++u)
+        if (const float* position = raw_.pixel(x + u, y + v); position[0] == position[0])
+          visit(u, v, Eigen::Vector2f(position[0], position[1]));
+  }
+
+  /// Sums of the weighted least-squares fit of a plane to the steps from `center` of the pixels that continue it.
+  struct PlaneFit {
+    Eigen::Matrix3f moments = Eigen::Matrix3f::Zero();
+    Eigen::Matrix<float, 3, 2> right = Eigen::Matrix<float, 3, 2>::Zero();
+    int continuing = 0;
+  };
+  PlaneFit fit_around(int x, int y, const Eigen::Vector2f& center) const {
+    constexpr float most_slope = 3;  // times the usual step: steeper is another surface
+    constexpr float tolerance = 1.2F;
+    PlaneFit fit;
+    float s = 0, su = 0, sv = 0, suu = 0, suv = 0, svv = 0;
+    Eigen::Vector2f b = Eigen::Vector2f::Zero(), bu = b, bv = b;
+    for_each_around(x, y, [&](int u, int v, const Eigen::Vector2f& position) {
+      const Eigen::Vector2f step = position - center;
+      const float fu = static_cast<float>(u), fv = static_cast<float>(v);
+      const float reach = tolerance + most_slope * scale_ * std::max(std::abs(fu), std::abs(fv));
+      if (std::abs(step.x()) > reach || std::abs(step.y()) > reach) return;
+      ++fit.continuing;
+      const float w = weight_.at(x + u, y + v);
+      s += w;
+      su += w * fu;
+      sv += w * fv;
+      suu += w * fu * fu;
+      suv += w * fu * fv;
+      svv += w * fv * fv;
+      b += w * step;
+      bu += w * fu * step;
+      bv += w * fv * step;
+    });
+    fit.moments << s, su, sv, su, suu, suv, sv, suv, svv;
+    fit.right.row(0) = b;
+    fit.right.row(1) = bu;
+    fit.right.row(2) = bv;
+    return fit;
+  }
+
+  /// The median of the positions around a pixel, each axis by itself.
+  std::optional<Eigen::Vector2f> median_around(int x, int y) const {
+    constexpr size_t most = 13 * 13;
+    std::array<std::array<float, most>, 2> values{};
+    size_t count = 0;
+    for_each_around(x, y, [&](int, int, const Eigen::Vector2f& position) {
+      values[0][count] = position.x();
+      values[1][count++] = position.y();
+    });
+    if (count == 0) return std::nullopt;
+    Eigen::Vector2f median;
+    for (size_t axis = 0; axis < 2; ++axis) {
+      const auto middle = values[axis].begin() + static_cast<std::ptrdiff_t>(count / 2);
+      std::nth_element(values[axis].begin(), middle, values[axis].begin() + static_cast<std::ptrdiff_t>(count));
+      median[static_cast<Eigen::Index>(axis)] = *middle;
+    }
+    return median;
+  }
+
+  /// A plane through the positions around each pixel that continue its own; where they do not (a bit of the pixel was
+  /// read wrongly), that continue their median.
+  void fit_row(int y, ProjectorCoordinates* out) const {
+    const int window = (2 * radius_ + 1) * (2 * radius_ + 1);
+    const auto enough = [&](int continuing) { return 3 * continuing >= window; };  // a surface's corner has a quarter
+    for (const LitPixel& pixel : rows_[static_cast<size_t>(y)]) {
+      const int x = pixel.x;
+      Eigen::Vector2f center(raw_.at(x, y, 0), raw_.at(x, y, 1));
+      PlaneFit fit;
+      if (center.x() == center.x()) fit = fit_around(x, y, center);
+      if (!enough(fit.continuing)) {
+        const auto median = median_around(x, y);
+        if (!median) continue;
+        center = *median;
+        fit = fit_around(x, y, center);
+        if (!enough(fit.continuing)) continue;
+      }
+      const Eigen::Matrix3f inverse = fit.moments.inverse();
+      const float variance = inverse(0, 0);
+      if (!(variance > 0) || !std::isfinite(variance)) continue;
+      const Eigen::RowVector2f offset = inverse.row(0) * fit.right;
+      constexpr float spike = 1.5F;
+      if (!(offset.cwiseAbs().maxCoeff() < spike)) continue;
+      out->position.at(x, y, 0) = center.x() + offset.x();
+      out->position.at(x, y, 1) = center.y() + offset.y();
+      // The weights are contrast² × slope²: with the noise of a difference of two images they are 1 / variance.
+      const float sigma = static_cast<float>(noise_ * std::numbers::sqrt2) * std::sqrt(variance);
+      constexpr float model_error = 0.03F;  // of blur that varies over the image, projector pixels
+      out->sigma.at(x, y, 0) = out->sigma.at(x, y, 1) = std::hypot(sigma, model_error);
+    }
+  }
+
+  const Sequence& s_;
+  const Work& work_;
+  const GrayCodeOptions& options_;
+  std::array<int, 2> sizes_;
+  int complete_ = 0;
+  double noise_ = 0;
+  double blur_ = 0;
+  float scale_ = 1;
+  int radius_ = 2;
+  std::vector<std::vector<LitPixel>> rows_;
+  FloatImage raw_, weight_;
+  Image tiles_;  ///< 1 where there is something to decode; empty: everywhere
+};
+
+}  // namespace
+
+Result<ProjectorCoordinates> decode_gray_code(std::span<const Frame> frames, const GrayCodePattern& pattern,
+                                              const Image* subject, const GrayCodeOptions& options, const Work& work) {
+  auto sequence = sort_images(frames, pattern);
+  if (!sequence) return sequence.error();
+  if (subject != nullptr && (subject->width != sequence->width || subject->height != sequence->height))
+    subject = nullptr;
+  ProjectorCoordinates out;
+  out.camera = frames.front().camera;
+  drop_contradicting(&*sequence, out.camera, &out.warnings);
+  if (const auto decoded = Decoder(*sequence, pattern, subject, options, work).run(&out); !decoded)
+    return Error{decoded.error().code, "camera " + out.camera + ": " + decoded.error().message};
+  return out;
+}
+
+}  // namespace booth

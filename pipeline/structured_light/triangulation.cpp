@@ -1,0 +1,211 @@
+#include "pipeline/structured_light/triangulation.h"
+
+#include <Eigen/Cholesky>
+#include <Eigen/Eigenvalues>
+#include <Eigen/LU>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <optional>
+
+#include "pipeline/geometry/camera_model.h"
+
+namespace booth {
+namespace {
+
+constexpr float nan = std::numeric_limits<float>::quiet_NaN();
+
+/// The undistorted direction of every pixel, by interpolation between exact ones: distortion is smooth.
+class RayTable {
+ public:
+  explicit RayTable(const Intrinsics& k) : columns_((k.width - 1) / spacing + 2), rows_((k.height - 1) / spacing + 2) {
+    rays_.reserve(static_cast<size_t>(columns_ * rows_));
+    for (int y = 0; y < rows_; ++y)
+      for (int x = 0; x < columns_; ++x)
+        rays_.push_back(unproject(k, Eigen::Vector2d(x * spacing, y * spacing)).head<2>());
+  }
+  /// (x, y) of the direction (x, y, 1) in the camera frame.
+  Eigen::Vector2d at(const Eigen::Vector2d& pixel) const {
+    const Eigen::Vector2d p =
+        (pixel / spacing).cwiseMax(0.0).cwiseMin(Eigen::Vector2d(columns_ - 1.001, rows_ - 1.001));
+    const int x = static_cast<int>(p.x()), y = static_cast<int>(p.y());
+    const double a = p.x() - x, b = p.y() - y;
+    const Eigen::Vector2d* r = rays_.data() + y * columns_ + x;
+    return (1 - b) * ((1 - a) * r[0] + a * r[1]) + b * ((1 - a) * r[columns_] + a * r[columns_ + 1]);
+  }
+
+ private:
+  static constexpr int spacing = 8;
+  int columns_, rows_;
+  std::vector<Eigen::Vector2d> rays_;
+};
+
+/// Where in a camera's image each projector pixel is seen: x, y and their standard deviation, camera pixels.
+FloatImage invert(const ProjectorCoordinates& view, int width, int height) {
+  FloatImage inverse(width, height, 3, nan);
+  const FloatImage& map = view.position;
+  constexpr float widest = 6;  // projector pixels between neighbours: farther apart they are two surfaces
+  const auto draw = [&](const std::array<Eigen::Vector2i, 3>& pixel) {
+    std::array<Eigen::Vector2f, 3> p;
+    for (size_t c = 0; c < 3; ++c) {
+      const float* at = map.pixel(pixel[c].x(), pixel[c].y());
+      p[c] = {at[0], at[1]};
+      if (at[0] != at[0]) return;
+    }
+    const Eigen::Vector2f e1 = p[1] - p[0], e2 = p[2] - p[0];
+    if (std::max({e1.norm(), e2.norm(), (e2 - e1).norm()}) > widest) return;
+    const float area = e1.x() * e2.y() - e1.y() * e2.x();  // of a camera pixel, in projector pixels
+    constexpr float grazing = 0.02F;
+    if (std::abs(area) < grazing) return;
+    float sigma = 0;
+    for (const Eigen::Vector2i& at : pixel) sigma = std::max(sigma, view.sigma.at(at.x(), at.y(), 0));
+    sigma /= std::sqrt(std::abs(area));
+    const Eigen::Vector2f low = p[0].cwiseMin(p[1]).cwiseMin(p[2]), high = p[0].cwiseMax(p[1]).cwiseMax(p[2]);
+    for (int y = std::max(0, static_cast<int>(std::ceil(low.y()))); y <= static_cast<int>(high.y()) && y < height; ++y)
+      for (int x = std::max(0, static_cast<int>(std::ceil(low.x()))); x <= static_cast<int>(high.x()) && x < width;
+           ++x) {
+        const Eigen::Vector2f d = Eigen::Vector2f(static_cast<float>(x), static_cast<float>(y)) - p[0];
+        const float b1 = (d.x() * e2.y() - d.y() * e2.x()) / area, b2 = (e1.x() * d.y() - e1.y() * d.x()) / area;
+        constexpr float rim = -1e-5F;
+        if (b1 < rim || b2 < rim || b1 + b2 > 1 - rim) continue;
+        float* out = inverse.pixel(x, y);
+        if (out[2] <= sigma) continue;  // a pixel seen twice (false positions do that) goes to the surer; NaN gives way
+        const Eigen::Vector2f at = pixel[0].cast<float>() + b1 * (pixel[1] - pixel[0]).cast<float>() +
+                                   b2 * (pixel[2] - pixel[0]).cast<float>();
+        out[0] = at.x();
+        out[1] = at.y();
+        out[2] = sigma;
+      }
+  };
+  for (int y = 0; y + 1 < map.height; ++y)
+    for (int x = 0; x + 1 < map.width; ++x) {
+      const Eigen::Vector2i a(x, y), b(x + 1, y), c(x, y + 1), d(x + 1, y + 1);
+      draw({a, b, d});
+      draw({a, d, c});
+    }
+  return inverse;
+}
+
+/// A ray with what its pixel's uncertainty means at unit depth.
+struct Sight {
+  Eigen::Vector3d center;
+  Eigen::Vector3d direction;  ///< world, of depth 1 in the camera's frame
+  double sigma;               ///< at unit depth
+  double focal;               ///< pixels
+  Eigen::Vector3d axis;       ///< the camera's optical axis in the world
+};
+
+struct Meeting {
+  Eigen::Vector3d point;
+  double residual_px = 0;  ///< largest
+  double sigma_m = 0;
+};
+
+/// The point of least weighted squared distance to the rays.
+std::optional<Meeting> meet(std::span<const Sight> sights) {
+  Meeting found;
+  std::array<double, 8> depth;
+  depth.fill(1);
+  Eigen::Matrix3d normal;
+  for (int pass = 0; pass < 2; ++pass) {  // the depths, which the weights need, are good enough after the first
+    normal.setZero();
+    Eigen::Vector3d right = Eigen::Vector3d::Zero();
+    for (size_t i = 0; i < sights.size(); ++i) {
+      const Eigen::Vector3d d = sights[i].direction.normalized();
+      const double spread = sights[i].sigma * depth[i];
+      const Eigen::Matrix3d across = (Eigen::Matrix3d::Identity() - d * d.transpose()) / (spread * spread);
+      normal += across;
+      right += across * sights[i].center;
+    }
+    found.point = normal.ldlt().solve(right);
+    for (size_t i = 0; i < sights.size(); ++i) {
+      depth[i] = sights[i].axis.dot(found.point - sights[i].center);
+      if (!(depth[i] > 0)) return std::nullopt;
+    }
+  }
+  for (size_t i = 0; i < sights.size(); ++i) {
+    const Eigen::Vector3d off = (found.point - sights[i].center) / depth[i] - sights[i].direction;
+    found.residual_px = std::max(found.residual_px, off.norm() * sights[i].focal);
+  }
+  Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> eigen;
+  eigen.computeDirect(normal, Eigen::EigenvaluesOnly);
+  const double least = eigen.eigenvalues()[0];
+  found.sigma_m = least > 0 ? 1 / std::sqrt(least) : std::numeric_limits<double>::infinity();
+  return found;
+}
+
+}  // namespace
+
+Result<RangeScan> triangulate(const Rig& rig, std::span<const ProjectorCoordinates> views, int width, int height,
+                              const TriangulationOptions& options, const Work& work) {
+  const CalibratedView* projector = rig.projector ? &*rig.projector : nullptr;
+  if (views.size() + (projector != nullptr ? 1 : 0) < 2)
+    return Error{ErrorCode::too_few_views, "structured light needs two cameras, or one and a calibrated projector"};
+  if (projector != nullptr && (projector->intrinsics.width != width || projector->intrinsics.height != height))
+    return Error{ErrorCode::invalid_argument,
+                 "the Gray-code pattern is not as large as the calibrated projector's image"};
+  constexpr size_t most_views = 7;  // more add nothing
+  if (views.size() > most_views) views = views.first(most_views);
+
+  struct Source {
+    const CalibratedView* camera;
+    RayTable rays;
+    FloatImage map;
+  };
+  std::vector<Source> sources;
+  for (const ProjectorCoordinates& view : views) {
+    const RigCamera* camera = rig.find(view.camera);
+    if (camera == nullptr) return Error{ErrorCode::not_found, "the rig has no camera " + view.camera};
+    sources.push_back({camera, RayTable(camera->intrinsics), {}});
+  }
+  work.parallel_for(sources.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t s = begin; s < end; ++s) sources[s].map = invert(views[s], width, height);
+  });
+  if (work.stopped()) return Work::cancelled();
+  std::optional<RayTable> projector_rays;
+  if (projector != nullptr) projector_rays.emplace(projector->intrinsics);
+
+  const auto sight = [](const CalibratedView& view, const Eigen::Vector2d& ray, double sigma_px) {
+    const Eigen::Matrix3d world_from_camera = view.camera_from_world.linear().transpose();
+    return Sight{view.center(), world_from_camera * ray.homogeneous(), sigma_px / view.intrinsics.fx,
+                 view.intrinsics.fx, world_from_camera.col(2)};
+  };
+
+  RangeScan scan(width, height);
+  constexpr size_t row_grain = 16;
+  work.parallel_for(static_cast<size_t>(height), row_grain, [&](size_t begin, size_t end) {
+    std::vector<Sight> sights;
+    for (int y = static_cast<int>(begin); y < static_cast<int>(end) && !work.stopped(); ++y)
+      for (int x = 0; x < width; ++x) {
+        sights.clear();
+        for (const Source& source : sources) {
+          const float* at = source.map.pixel(x, y);
+          if (at[0] == at[0])
+            sights.push_back(sight(*source.camera, source.rays.at(Eigen::Vector2d(at[0], at[1])), at[2]));
+        }
+        if (sights.empty()) continue;
+        constexpr double projector_sigma_px = 0.02;  // the pixel is exact; its calibration is not
+        if (projector != nullptr)
+          sights.push_back(sight(*projector, projector_rays->at(Eigen::Vector2d(x, y)), projector_sigma_px));
+        if (sights.size() < 2) continue;
+        auto found = meet(sights);
+        if (sights.size() > 2 && (!found || found->residual_px > options.most_residual_px)) {
+          // One of them decoded wrongly: the pair with the last sight (the projector's, if any) that meets best.
+          found.reset();
+          for (size_t i = 0; i + 1 < sights.size(); ++i) {
+            const std::array<Sight, 2> pair{sights[i], sights.back()};
+            const auto other = meet(pair);
+            if (other && (!found || other->residual_px < found->residual_px)) found = other;
+          }
+        }
+        if (!found || found->residual_px > options.most_residual_px || found->sigma_m > options.most_sigma_m) continue;
+        const size_t i = scan.index(x, y);
+        scan.points[i] = found->point.cast<float>();
+        scan.sigma_m[i] = static_cast<float>(found->sigma_m);
+      }
+  });
+  if (work.stopped()) return Work::cancelled();
+  return scan;
+}
+
+}  // namespace booth
