@@ -1,8 +1,11 @@
 #include "pipeline/atlas/colour_balance.h"
 
 #include <Eigen/Cholesky>
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <numeric>
 
 #include "pipeline/atlas/view_sampling.h"
 
@@ -16,7 +19,21 @@ struct Pair {
   Eigen::Array3f difference;  ///< log(one) − log(other)
 };
 
-std::vector<Pair> overlaps(std::span<const PreparedView> views, const CameraRatings& ratings) {
+/// The area around each vertex, as a multiple of the mean.
+std::vector<float> relative_areas(const Mesh& mesh) {
+  std::vector<float> areas(mesh.positions.size(), 0.0F);
+  for (const auto& [a, b, c] : mesh.triangles) {
+    const Eigen::Vector3f one = mesh.positions[b] - mesh.positions[a];
+    const float area = one.cross(mesh.positions[c] - mesh.positions[a]).norm();
+    for (const uint32_t v : {a, b, c}) areas[v] += area;
+  }
+  const double sum = std::accumulate(areas.begin(), areas.end(), 0.0);
+  const float scale = sum > 0 ? static_cast<float>(static_cast<double>(areas.size()) / sum) : 0.0F;
+  for (float& area : areas) area *= scale;
+  return areas;
+}
+
+std::vector<Pair> overlaps(const Mesh& mesh, std::span<const PreparedView> views, const CameraRatings& ratings) {
   constexpr float good_share = 0.35F;                   // of the best camera's rating
   constexpr float least_trust = 0.9F;                   // clear of outlines and depth steps
   constexpr size_t level = 2;                           // blurred by four pixels: the surface is not exact
@@ -28,8 +45,8 @@ std::vector<Pair> overlaps(std::span<const PreparedView> views, const CameraRati
   };
   std::vector<Pair> pairs;
   std::vector<Sample> samples;
-  const size_t vertices = views.empty() ? 0 : views[0].projected.size();
-  for (size_t v = 0; v < vertices; ++v) {
+  const std::vector<float> areas = relative_areas(mesh);
+  for (size_t v = 0; v < mesh.positions.size(); ++v) {
     const auto rating = ratings.vertex(v);
     const float best = *std::max_element(rating.begin(), rating.end());
     if (!(best > 0)) continue;
@@ -47,7 +64,8 @@ std::vector<Pair> overlaps(std::span<const PreparedView> views, const CameraRati
     }
     for (size_t i = 0; i < samples.size(); ++i)
       for (size_t j = i + 1; j < samples.size(); ++j)
-        pairs.push_back({samples[i].camera, samples[j].camera, std::sqrt(samples[i].rating * samples[j].rating),
+        pairs.push_back({samples[i].camera, samples[j].camera,
+                         areas[v] * std::sqrt(samples[i].rating * samples[j].rating),
                          samples[i].light - samples[j].light});
   }
   return pairs;
@@ -55,9 +73,10 @@ std::vector<Pair> overlaps(std::span<const PreparedView> views, const CameraRati
 
 }  // namespace
 
-std::vector<Eigen::Array3f> balance_colours(std::span<const PreparedView> views, const CameraRatings& ratings) {
+std::vector<Eigen::Array3f> balance_colours(const Mesh& mesh, std::span<const PreparedView> views,
+                                            const CameraRatings& ratings) {
   const auto cameras = static_cast<Eigen::Index>(views.size());
-  const std::vector<Pair> pairs = overlaps(views, ratings);
+  const std::vector<Pair> pairs = overlaps(mesh, views, ratings);
   std::vector<Eigen::Array3f> gains(views.size(), Eigen::Array3f::Ones());
   constexpr int rounds = 8;
   constexpr double scale = 0.08;  // log units: what disagrees by more is another surface or a highlight

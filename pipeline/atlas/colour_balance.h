@@ -6,6 +6,7 @@
 
 #include "pipeline/atlas/camera_ratings.h"
 #include "pipeline/atlas/input_preparation.h"
+#include "pipeline/types/mesh.h"
 
 namespace booth {
 
@@ -15,7 +16,11 @@ namespace booth {
 /// others keeps 1.
 ///
 /// Method: robust least squares on the logarithms of blurred colours at the vertices, over all pairs of cameras
-/// that see a vertex well (iteratively reweighted, Cauchy weights).
-std::vector<Eigen::Array3f> balance_colours(std::span<const PreparedView> views, const CameraRatings& ratings);
+/// that see a vertex well (iteratively reweighted, Cauchy weights). A vertex counts by its area: a finely meshed,
+/// glossy face must not decide the colours of a shirt.
+///
+/// @param mesh  world frame, metres; its vertices are those that the views hold projected and the ratings rate
+std::vector<Eigen::Array3f> balance_colours(const Mesh& mesh, std::span<const PreparedView> views,
+                                            const CameraRatings& ratings);
 
 }  // namespace booth

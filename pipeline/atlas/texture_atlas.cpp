@@ -143,7 +143,7 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& mesh, const Rig& rig, std::
   work.report(0.6);
 
   const std::vector<Eigen::Array3f> gains = options.balance_colours
-                                                ? balance_colours(views, ratings)
+                                                ? balance_colours(mesh, views, ratings)
                                                 : std::vector<Eigen::Array3f>(views.size(), Eigen::Array3f::Ones());
   TexelColours texels = blend_texels(mesh, packing, options.size, views, ratings, gains, options.blending, work);
   if (work.stopped()) return Work::cancelled();
