@@ -327,6 +327,8 @@ void visit_reconstruct(Visitor& visitor, ReconstructionOptions& options) {
   visitor.integer("min_views", options.hull.min_views, 1, 256);
   visitor.choice("skeleton", options.skeleton.method,
                  Words<SkeletonMethod>{{"anatomy", SkeletonMethod::anatomy}, {"embedding", SkeletonMethod::embedding}});
+  visitor.choice("skin", options.skinning.method,
+                 Words<SkinningMethod>{{"heat", SkinningMethod::heat}, {"regions", SkinningMethod::regions}});
 }
 
 template <class Visitor>

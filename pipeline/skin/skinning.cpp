@@ -6,9 +6,13 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdint>
+#include <functional>
 #include <limits>
 #include <optional>
+#include <queue>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "pipeline/geometry/interior.h"
@@ -241,6 +245,103 @@ Laplacian laplacian(const Mesh& mesh) {
   return result;
 }
 
+/// What a joint weighs at each vertex, before only the strongest are kept; empty for a joint without vertices.
+using Shares = std::vector<Eigen::VectorXd>;
+
+Result<Shares> heat_shares(const Mesh& mesh, const std::vector<Attachment>& attachments, size_t joints,
+                           double stiffness, const Work& work) {
+  // (−Δ + H) w = H p, with H = stiffness / distance² and p one where the joint is the vertex's own.
+  const Eigen::Index vertices = static_cast<Eigen::Index>(mesh.positions.size());
+  Laplacian heat = laplacian(mesh);
+  Eigen::VectorXd warmth(vertices);
+  constexpr double least_distance_m = 0.005;
+  constexpr double least_area_m2 = 1e-9;  // a vertex without triangles keeps its own joint
+  for (Eigen::Index v = 0; v < vertices; ++v) {
+    const double d = std::max(attachments[static_cast<size_t>(v)].distance_m, least_distance_m);
+    warmth[v] = stiffness * std::max(heat.area[v], least_area_m2) / (d * d);
+    heat.stiffness.emplace_back(static_cast<int>(v), static_cast<int>(v), warmth[v]);
+  }
+  Eigen::SparseMatrix<double> matrix(vertices, vertices);
+  matrix.setFromTriplets(heat.stiffness.begin(), heat.stiffness.end());
+  const Eigen::SimplicialLDLT<Eigen::SparseMatrix<double>> solver(matrix);
+  if (solver.info() != Eigen::Success) return Error{ErrorCode::internal, "skin: the heat equation could not be solved"};
+  if (work.stopped()) return Work::cancelled();
+  work.report(0.6);
+
+  std::vector<Eigen::VectorXd> shares(joints);
+  work.parallel_for(shares.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t j = begin; j < end; ++j) {
+      Eigen::VectorXd source = Eigen::VectorXd::Zero(vertices);
+      for (Eigen::Index v = 0; v < vertices; ++v)
+        if (attachments[static_cast<size_t>(v)].joint == j) source[v] = warmth[v];
+      if (source.any()) shares[j] = solver.solve(source);
+    }
+  });
+  return shares;
+}
+
+/// Each vertex's neighbours along edges, with the edges' lengths.
+std::vector<std::vector<std::pair<uint32_t, double>>> edges_of(const Mesh& mesh) {
+  std::vector<std::vector<std::pair<uint32_t, double>>> edges(mesh.positions.size());
+  for (const auto& t : mesh.triangles)
+    for (size_t c = 0; c < 3; ++c) {
+      const uint32_t a = t[c], b = t[(c + 1) % 3];
+      edges[a].emplace_back(b, static_cast<double>((mesh.positions[a] - mesh.positions[b]).norm()));
+    }
+  return edges;
+}
+
+/// The way along edges from each vertex to the border of a joint's region, which runs across the middles of edges;
+/// infinite beyond `limit_m`.
+std::vector<double> ways_to_border(const std::vector<std::vector<std::pair<uint32_t, double>>>& edges,
+                                   const std::vector<Attachment>& attachments, size_t joint, double limit_m) {
+  std::vector<double> ways(edges.size(), std::numeric_limits<double>::infinity());
+  using Entry = std::pair<double, uint32_t>;
+  std::priority_queue<Entry, std::vector<Entry>, std::greater<>> front;
+  const auto reach = [&](uint32_t vertex, double way) {
+    if (way > limit_m || way >= ways[vertex]) return;
+    ways[vertex] = way;
+    front.emplace(way, vertex);
+  };
+  for (uint32_t a = 0; a < edges.size(); ++a)
+    for (const auto& [b, length] : edges[a])
+      if ((attachments[a].joint == joint) != (attachments[b].joint == joint)) reach(a, length / 2);
+  while (!front.empty()) {
+    const auto [way, vertex] = front.top();
+    front.pop();
+    if (way > ways[vertex]) continue;
+    for (const auto& [next, length] : edges[vertex]) reach(next, way + length);
+  }
+  return ways;
+}
+
+Result<Shares> region_shares(const Mesh& mesh, const std::vector<Attachment>& attachments, size_t joints,
+                             double overlap, const Work& work) {
+  constexpr double least_width_m = 0.005;
+  const auto edges = edges_of(mesh);
+  double widest = least_width_m;
+  for (const Attachment& own : attachments) widest = std::max(widest, overlap * own.distance_m);
+  std::vector<bool> used(joints, false);
+  for (const Attachment& own : attachments) used[own.joint] = true;
+  Shares shares(joints);
+  work.parallel_for(joints, 1, [&](size_t begin, size_t end) {
+    for (size_t j = begin; j < end; ++j) {
+      if (!used[j] || work.stopped()) continue;
+      const std::vector<double> ways = ways_to_border(edges, attachments, j, widest);
+      shares[j] = Eigen::VectorXd::Zero(static_cast<Eigen::Index>(ways.size()));
+      for (size_t v = 0; v < ways.size(); ++v) {
+        const double width = std::max(overlap * attachments[v].distance_m, least_width_m);
+        const double depth = (attachments[v].joint == j ? 1 : -1) * std::min(ways[v] / width, 1.0);
+        // The cubic from 0 to 1 with level ends.
+        const double t = 0.5 * (1 + depth);
+        shares[j][static_cast<Eigen::Index>(v)] = t * t * (3 - 2 * t);
+      }
+    }
+  });
+  if (work.stopped()) return Work::cancelled();
+  return shares;
+}
+
 /// The four largest of a vertex's weights, without traces, as shares of their sum.
 JointInfluences strongest(const std::vector<float>& weights) {
   constexpr float trace = 0.01F;
@@ -269,6 +370,9 @@ Result<Skin> compute_skin(const Mesh& mesh, const Skeleton& skeleton, const Skin
   if (!(options.stiffness >= 0.1 && options.stiffness <= 10))
     return Error{ErrorCode::invalid_argument,
                  "skin.stiffness: " + std::to_string(options.stiffness) + ", expected 0.1 … 10"};
+  if (!(options.overlap >= 0.1 && options.overlap <= 3))
+    return Error{ErrorCode::invalid_argument,
+                 "skin.overlap: " + std::to_string(options.overlap) + ", expected 0.1 … 3"};
   if (options.cells < 60 || options.cells > 400)
     return Error{ErrorCode::invalid_argument, "skin.cells: " + std::to_string(options.cells) + ", expected 60 … 400"};
   if (const auto checked = check(mesh); !checked) return checked.error();
@@ -288,40 +392,20 @@ Result<Skin> compute_skin(const Mesh& mesh, const Skeleton& skeleton, const Skin
   if (work.stopped()) return Work::cancelled();
   work.report(0.3);
 
-  // (−Δ + H) w = H p, with H = stiffness / distance² and p one where the joint is the vertex's own.
-  const Eigen::Index vertices = static_cast<Eigen::Index>(mesh.positions.size());
-  Laplacian heat = laplacian(mesh);
-  Eigen::VectorXd warmth(vertices);
-  constexpr double least_distance_m = 0.005;
-  constexpr double least_area_m2 = 1e-9;  // a vertex without triangles keeps its own joint
-  for (Eigen::Index v = 0; v < vertices; ++v) {
-    const double d = std::max(attachments[static_cast<size_t>(v)].distance_m, least_distance_m);
-    warmth[v] = options.stiffness * std::max(heat.area[v], least_area_m2) / (d * d);
-    heat.stiffness.emplace_back(static_cast<int>(v), static_cast<int>(v), warmth[v]);
-  }
-  Eigen::SparseMatrix<double> matrix(vertices, vertices);
-  matrix.setFromTriplets(heat.stiffness.begin(), heat.stiffness.end());
-  const Eigen::SimplicialLDLT<Eigen::SparseMatrix<double>> solver(matrix);
-  if (solver.info() != Eigen::Success) return Error{ErrorCode::internal, "skin: the heat equation could not be solved"};
+  auto shares = options.method == SkinningMethod::heat
+                    ? heat_shares(mesh, attachments, skeleton.joints.size(), options.stiffness, work)
+                    : region_shares(mesh, attachments, skeleton.joints.size(), options.overlap, work);
+  if (!shares) return shares.error();
   if (work.stopped()) return Work::cancelled();
-  work.report(0.6);
+  work.report(0.9);
 
-  std::vector<Eigen::VectorXd> shares(skeleton.joints.size());
-  work.parallel_for(shares.size(), 1, [&](size_t begin, size_t end) {
-    for (size_t j = begin; j < end; ++j) {
-      Eigen::VectorXd source = Eigen::VectorXd::Zero(vertices);
-      for (Eigen::Index v = 0; v < vertices; ++v)
-        if (attachments[static_cast<size_t>(v)].joint == j) source[v] = warmth[v];
-      if (source.any()) shares[j] = solver.solve(source);
-    }
-  });
   Skin skin;
   skin.influences.resize(mesh.positions.size());
   work.parallel_for(skin.influences.size(), 1024, [&](size_t begin, size_t end) {
     std::vector<float> weights(skeleton.joints.size());
     for (size_t v = begin; v < end; ++v) {
       for (size_t j = 0; j < weights.size(); ++j)
-        weights[j] = shares[j].size() > 0 ? static_cast<float>(shares[j][static_cast<Eigen::Index>(v)]) : 0.0F;
+        weights[j] = (*shares)[j].size() > 0 ? static_cast<float>((*shares)[j][static_cast<Eigen::Index>(v)]) : 0.0F;
       skin.influences[v] = strongest(weights);
     }
   });

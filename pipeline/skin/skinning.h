@@ -5,8 +5,15 @@
 
 namespace booth {
 
+enum class SkinningMethod {
+  heat,    ///< weights are temperatures in equilibrium
+  regions  ///< the method of reference: regions grown into overlaps, a smooth transition on each
+};
+
 struct SkinningOptions {
-  double stiffness = 3.0;  ///< how quickly a vertex takes its own bone's motion on, 0.1 … 10; lower blends wider
+  SkinningMethod method = SkinningMethod::heat;
+  double stiffness = 3.0;  ///< heat: how quickly a vertex takes its own bone's motion on, 0.1 … 10; lower blends wider
+  double overlap = 0.7;    ///< regions: how far each grows over its border, in radii of the limb there, 0.1 … 3
   int cells = 160;         ///< voxels along the height of the body, in which bones are assigned, 60 … 400
 };
 
@@ -15,6 +22,8 @@ struct SkinningOptions {
 /// Each vertex belongs to the bone that is nearest through the inside of the body, counted from the thickness of the
 /// limb around the bone, so that arm and trunk or the two legs do not catch each other across a gap. From there the
 /// weights spread over the surface like heat: a bone's share is the equilibrium temperature when it alone is warm.
+/// Or, by the method of reference, each joint's region grows over its border along the surface, and a joint's weight
+/// falls smoothly across the overlap, half of it on the border; beyond it the skin is rigid.
 /// A joint's weight is that of the bones from it to its children; joints that end a limb move what lies along their
 /// +Y axis, and those named "…_End" nothing.
 ///
@@ -25,7 +34,8 @@ struct SkinningOptions {
 /// Cost: one sparse Cholesky factorisation of V × V and a solve a joint; about 0.2 s for 10,000 vertices.
 /// Source: heat equilibrium: I. Baran, J. Popović, "Automatic rigging and animation of 3D characters", SIGGRAPH 2007,
 /// section 4; distances through the inside: O. Dionne, M. de Lasa, "Geodesic voxel binding for production character
-/// meshes", SCA 2013.
+/// meshes", SCA 2013; regions: F. Hétroy, C. Gérot, L. Lu, B. Thibert, "Simple flexible skinning based on manifold
+/// modeling", GRAPP 2009.
 Result<Skin> compute_skin(const Mesh& mesh, const Skeleton& skeleton, const SkinningOptions& options,
                           const Work& work = {});
 

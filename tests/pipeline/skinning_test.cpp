@@ -95,12 +95,12 @@ struct Skinned {
   }
 };
 
-Skinned skinned_person(const synthetic::PersonOptions& options = {}) {
+Skinned skinned_person(const synthetic::PersonOptions& options = {}, const SkinningOptions& skinning = {}) {
   Skinned result;
   result.person = synthetic::person(options);
   result.mesh = surface_of(result.person.body);
   result.skeleton = skeleton_of(result.person);
-  auto skin = compute_skin(result.mesh, result.skeleton, {});
+  auto skin = compute_skin(result.mesh, result.skeleton, skinning);
   EXPECT_TRUE(skin) << skin.error().message;
   if (skin) result.skin = std::move(skin).value();
   return result;
@@ -203,8 +203,7 @@ TEST(Skinning, ArmsBesideTheTrunkDoNotTakeItAlong) {
   EXPECT_GT(flank, 100);
 }
 
-TEST(Skinning, BendsKeepTheirVolumeAndDoNotTear) {
-  const Skinned body = skinned_person();
+void expect_bends_to_keep_volume(const Skinned& body) {
   std::vector<Vector3d> rest;
   for (const auto& p : body.mesh.positions) rest.push_back(p.cast<double>());
   const double whole = volume(body.mesh, rest);
@@ -224,6 +223,54 @@ TEST(Skinning, BendsKeepTheirVolumeAndDoNotTear) {
         EXPECT_LT((moved[t[c]] - moved[t[(c + 1) % 3]]).norm(), 2.5 * before + 0.004) << pose.joint;
       }
   }
+}
+
+TEST(Skinning, BendsKeepTheirVolumeAndDoNotTear) { expect_bends_to_keep_volume(skinned_person()); }
+
+TEST(SkinningByRegions, HoldsTheContractAndBendsWell) {
+  const Skinned body = skinned_person({}, {.method = SkinningMethod::regions});
+  const auto checked = check(body.skin, body.mesh.positions.size(), body.skeleton.joints.size());
+  EXPECT_TRUE(checked) << checked.error().message;
+  expect_bends_to_keep_volume(body);
+}
+
+TEST(SkinningByRegions, IsRigidAwayFromJointsAndBlendsAcrossThem) {
+  const Skinned body = skinned_person({}, {.method = SkinningMethod::regions});
+  const Vector3d elbow = body.joint("LeftForeArm"), wrist = body.joint("LeftHand");
+  int middle = 0, blended = 0;
+  for (size_t v = 0; v < body.mesh.positions.size(); ++v) {
+    const Vector3d p = body.mesh.positions[v].cast<double>();
+    const double t = (p - elbow).dot(wrist - elbow) / (wrist - elbow).squaredNorm();
+    if ((p - elbow - t * (wrist - elbow)).norm() > 0.08) continue;
+    const double forearm = body.weight(v, "LeftForeArm"), arm = body.weight(v, "LeftArm");
+    if (t > 0.4 && t < 0.6) {
+      EXPECT_EQ(forearm, 1);
+      ++middle;
+    } else if (std::abs(t) < 0.3) {
+      EXPECT_NEAR(forearm + arm, 1, 1e-6);
+      if (t < -0.2) {
+        EXPECT_LT(forearm, 0.1);
+      }
+      if (t > 0.2) {
+        EXPECT_GT(forearm, 0.9);
+      }
+      blended += forearm > 0.1 && arm > 0.1 ? 1 : 0;
+    }
+  }
+  EXPECT_GT(middle, 20);
+  EXPECT_GT(blended, 20);
+}
+
+TEST(SkinningByRegions, AWiderOverlapIsSofter) {
+  const auto blended = [](double overlap) {
+    const Skinned body = skinned_person({}, {.method = SkinningMethod::regions, .overlap = overlap});
+    return std::count_if(body.skin.influences.begin(), body.skin.influences.end(),
+                         [](const JointInfluences& of) { return of.weight[1] > 0; });
+  };
+  const auto narrow = blended(0.2), usual = blended(0.7), wide = blended(1.5);
+  EXPECT_GT(narrow, 0);
+  EXPECT_GT(usual, 2 * narrow);
+  EXPECT_GT(wide, usual);
 }
 
 TEST(Skinning, MirrorsWithTheBody) {
@@ -257,14 +304,16 @@ TEST(Skinning, PartsBesideTheBodyGetWeightsToo) {
 }
 
 TEST(Skinning, SameBytesOnAnyNumberOfThreads) {
-  const Skinned body = skinned_person();
-  ThreadPool pool(4);
-  const auto skin = compute_skin(body.mesh, body.skeleton, {}, pool.work());
-  ASSERT_TRUE(skin);
-  ASSERT_EQ(skin->influences.size(), body.skin.influences.size());
-  for (size_t v = 0; v < skin->influences.size(); ++v) {
-    EXPECT_EQ(skin->influences[v].joint, body.skin.influences[v].joint);
-    EXPECT_EQ(skin->influences[v].weight, body.skin.influences[v].weight);
+  for (const SkinningMethod method : {SkinningMethod::heat, SkinningMethod::regions}) {
+    const Skinned body = skinned_person({}, {.method = method});
+    ThreadPool pool(4);
+    const auto skin = compute_skin(body.mesh, body.skeleton, {.method = method}, pool.work());
+    ASSERT_TRUE(skin);
+    ASSERT_EQ(skin->influences.size(), body.skin.influences.size());
+    for (size_t v = 0; v < skin->influences.size(); ++v) {
+      EXPECT_EQ(skin->influences[v].joint, body.skin.influences[v].joint);
+      EXPECT_EQ(skin->influences[v].weight, body.skin.influences[v].weight);
+    }
   }
 }
 
@@ -274,6 +323,7 @@ TEST(Skinning, RefusesWhatItCannotSkin) {
   EXPECT_EQ(code(compute_skin({}, body.skeleton, {})), ErrorCode::invalid_argument);
   EXPECT_EQ(code(compute_skin(body.mesh, {}, {})), ErrorCode::invalid_argument);
   EXPECT_EQ(code(compute_skin(body.mesh, body.skeleton, {.stiffness = 0})), ErrorCode::invalid_argument);
+  EXPECT_EQ(code(compute_skin(body.mesh, body.skeleton, {.overlap = 0})), ErrorCode::invalid_argument);
   EXPECT_EQ(code(compute_skin(body.mesh, body.skeleton, {.cells = 5})), ErrorCode::invalid_argument);
   std::stop_source stop;
   stop.request_stop();
