@@ -125,7 +125,7 @@ void visit_aravis(Visitor& visitor, AravisCameraSettings& camera) {
   visitor.integer("socket_buffer_kib", camera.socket_buffer_kib, 64, 1'048'576);
   visitor.boolean("packet_socket", camera.packet_socket);
   visitor.integer("buffers", camera.buffers, 0, 256);
-  visitor.integer("heartbeat_ms", camera.heartbeat_ms, 500, 60'000);
+  visitor.integer("heartbeat_ms", camera.heartbeat_ms, 2000, 60'000);
   visitor.boolean("ptp", camera.ptp);
   Assignments features;
   for (const AravisFeature& feature : camera.features) features.emplace_back(feature.name, feature.value);

@@ -345,8 +345,9 @@ Result<void> AravisCamera::arm(const CaptureSettings& settings, int count) {
                  "camera " + settings_.id + ": cannot be armed for " + std::to_string(count) + " frames"};
   const std::lock_guard lock(control_);
   const auto failed = [&](const Error& error) {
-    if (error.code == ErrorCode::device_lost) announce_loss();
-    return error;
+    if (error.code != ErrorCode::device_lost) return error;
+    announce_loss();
+    return lost();
   };
   {
     const std::lock_guard events_lock(events_->mutex);

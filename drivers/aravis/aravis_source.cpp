@@ -23,6 +23,13 @@ constexpr std::chrono::milliseconds locate_patience{600};
 /// A discovery this young is as good as a new one: when all cameras open at once, they need not all ask.
 constexpr Timestamp discovery_age = seconds(2);
 
+/// Opening a device reads its GenICam description, for which Aravis' parser has one state for the whole process: two
+/// at once get each other's features, or crash.
+std::mutex& parser_mutex() {
+  static std::mutex mutex;
+  return mutex;
+}
+
 struct FoundDevice {
   std::string device_id, serial, model, address;
   bool gige = false;
@@ -127,6 +134,7 @@ Result<GObjectPtr<ArvDevice>> open_gige(const AravisCameraSettings& settings, in
   const GObjectPtr<GInetAddress> device(
       g_inet_address_new_from_bytes(reinterpret_cast<const guint8*>(&address.s_addr), G_SOCKET_FAMILY_IPV4));
   GErrorSlot error;
+  const std::lock_guard lock(parser_mutex());
   GObjectPtr<ArvDevice> opened(arv_gv_device_new(interface.get(), device.get(), error.out()));
   if (!opened) return Error{ErrorCode::device_lost, "camera " + settings.id + ": " + error.message()};
   return opened;
@@ -134,6 +142,7 @@ Result<GObjectPtr<ArvDevice>> open_gige(const AravisCameraSettings& settings, in
 
 Result<GObjectPtr<ArvDevice>> open_usb(const AravisCameraSettings& settings, const std::string& device_id) {
   GErrorSlot error;
+  const std::lock_guard lock(parser_mutex());
   GObjectPtr<ArvDevice> opened(arv_open_device(device_id.c_str(), error.out()));
   if (!opened) return Error{ErrorCode::device_lost, "camera " + settings.id + ": " + error.message()};
   return opened;

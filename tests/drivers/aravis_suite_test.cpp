@@ -600,6 +600,26 @@ TEST_F(AravisSuite, TimestampsFollowAClockOfAnotherRate) {
   }
 }
 
+TEST_F(AravisSuite, AllCamerasMayBeOpenedAtOnce) {
+  constexpr size_t cameras = 6;
+  constexpr int rounds = 3;
+  for (size_t i = 0; i < cameras; ++i) add_camera();
+  for (int round = 0; round < rounds; ++round) {
+    source.reset();
+    create_source();
+    std::vector<std::string> faults(cameras);
+    std::vector<std::jthread> threads;
+    for (size_t i = 0; i < cameras; ++i)
+      threads.emplace_back([&, i] {
+        const auto camera = source->open_camera(settings.cameras[i].id);
+        const auto armed = camera ? (*camera)->arm({.role = ShotRole::body}, 1) : Result<void>(camera.error());
+        if (!armed) faults[i] = armed.error().message;
+      });
+    threads.clear();
+    for (const std::string& fault : faults) EXPECT_EQ(fault, "");
+  }
+}
+
 TEST_F(AravisSuite, DiscoversWhoIsThere) {
   add_camera();
   add_camera();

@@ -279,6 +279,11 @@ class GigeCamera::Device {
   int lose_next = 0;
   bool swallow_next = false;
   bool cut_next = false;
+  void see(std::vector<std::shared_ptr<const Image>> scenes) {
+    scenes_ = std::move(scenes);
+    wire_.assign(scenes_.size(), nullptr);
+    next_scene_ = 0;
+  }
   void mute(bool muted) { muted_ = muted; }
   void set_ptp(const std::string& status) {
     static const std::map<std::string, uint32_t> values = {{"Initializing", 1}, {"Faulty", 2}, {"Disabled", 3},
@@ -567,11 +572,11 @@ class GigeCamera::Device {
   std::shared_ptr<const std::vector<uint8_t>> read_sensor() {
     const std::array<uint32_t, 5> settings{word(pixel_format), word(width), word(height), word(offset_x),
                                            word(offset_y)};
-    if (settings != wire_settings_) wire_.assign(options_.scenes.size(), nullptr);
+    if (settings != wire_settings_) wire_.assign(scenes_.size(), nullptr);
     wire_settings_ = settings;
-    const size_t number = next_scene_++ % options_.scenes.size();
+    const size_t number = next_scene_++ % scenes_.size();
     if (wire_[number]) return wire_[number];
-    const Image& scene = *options_.scenes[number];
+    const Image& scene = *scenes_[number];
     auto bytes = std::make_shared<std::vector<uint8_t>>();
     bytes->reserve(size_t{settings[1]} * settings[2] * (settings[0] == rgb8 ? 3 : 1));
     for (int y = 0; y < static_cast<int>(settings[2]); ++y) {
@@ -716,6 +721,7 @@ class GigeCamera::Device {
   uint64_t heard_ns_ = 0, powered_on_ns_ = 0, next_free_ = 0;
   std::optional<Exposure> pending_;
   uint16_t block_id_ = 0;
+  std::vector<std::shared_ptr<const Image>> scenes_ = options_.scenes;
   size_t next_scene_ = 0;
   std::array<uint32_t, 5> wire_settings_{};
   std::vector<std::shared_ptr<const std::vector<uint8_t>>> wire_;
@@ -796,6 +802,9 @@ void GigeCamera::pulse() {
   orders_.push_back([](Device& device) { device.pulse(); });
   ++posted_;
   eventfd_write(wake_, 1);
+}
+void GigeCamera::see(std::vector<std::shared_ptr<const Image>> scenes) {
+  post([&](Device& device) { device.see(std::move(scenes)); });
 }
 void GigeCamera::lose_packets(double share) {
   post([=](Device& device) { device.loss = share; });

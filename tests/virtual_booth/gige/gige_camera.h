@@ -56,6 +56,9 @@ class GigeCamera {
   /// A pulse on the trigger line: one exposure, if it is armed. Returns at once.
   void pulse();
 
+  /// What is in front of it from the next exposure on; one or more, of the size that it saw before.
+  void see(std::vector<std::shared_ptr<const Image>> scenes);
+
   /// Loses this share of all stream packets, resent ones included.
   void lose_packets(double share);
   /// Loses that many packets of the next frame, spread over it; they can be had again.
