@@ -37,6 +37,9 @@ Json camera_json(const RigCamera& camera) {
   json["mount_rotation_deg"] = camera.mount_rotation_deg;
   add_calibration(json, camera);
   if (camera.rms_px) json["rms_px"] = *camera.rms_px;
+  if (camera.uncertainty)
+    json["uncertainty"] = {{"center_m", camera.uncertainty->center_m},
+                           {"rotation_rad", camera.uncertainty->rotation_rad}};
   return json;
 }
 

@@ -97,6 +97,11 @@ RigCamera read_camera(const JsonField& field, CameraRole role) {
   }
   constexpr double largest_rms_px = 1e6;
   if (const auto rms = field.find("rms_px")) camera.rms_px = rms->number(0, largest_rms_px);
+  constexpr double largest_uncertainty = 1e6;
+  if (const auto uncertainty = field.find("uncertainty"))
+    camera.uncertainty =
+        PoseUncertainty{.center_m = uncertainty->member("center_m").number(0, largest_uncertainty),
+                        .rotation_rad = uncertainty->member("rotation_rad").number(0, largest_uncertainty)};
   return camera;
 }
 

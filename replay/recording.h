@@ -24,13 +24,6 @@ struct FrameRecord {
   std::optional<Mosaic> mosaic = {};  ///< of a raw frame
 };
 
-struct CalibrationBoard {
-  std::string type = "charuco";
-  int squares_x = 0, squares_y = 0;
-  double square_m = 0, marker_m = 0;
-  std::string dictionary;
-};
-
 struct Shot {
   std::string name;  ///< file-name safe
   ShotRole role = ShotRole::body;

@@ -31,10 +31,17 @@ struct CalibratedView {
 
 enum class CameraRole { body, face };
 
+/// Standard deviations of a calibrated pose in the world frame.
+struct PoseUncertainty {
+  double center_m = 0;      ///< of the optical centre, along its least certain direction
+  double rotation_rad = 0;  ///< about its least certain axis
+};
+
 struct RigCamera : CalibratedView {
   CameraRole role = CameraRole::body;
   int mount_rotation_deg = 0;    ///< turning the stored image clockwise by it makes it upright: 0, 90, 180, 270
   std::optional<double> rms_px;  ///< reprojection error of its calibration
+  std::optional<PoseUncertainty> uncertainty;  ///< of its calibration
 };
 
 /// The calibrated booth: rig.json. World frame: right-handed, +Y up, floor at y = 0, the subject faces +Z

@@ -27,4 +27,12 @@ struct GrayCodePattern {
 /// How many images the sequence has: 42 for 1024 × 768 with columns, rows and inverses.
 int pattern_count(const GrayCodePattern& pattern);
 
+/// A ChArUco board: a chessboard with a marker in each of its white squares.
+struct CalibrationBoard {
+  std::string type = "charuco";
+  int squares_x = 0, squares_y = 0;   ///< along the board's x and y axes
+  double square_m = 0, marker_m = 0;  ///< edges of a square and of a marker, metres
+  std::string dictionary;             ///< OpenCV's name of the markers' dictionary: "DICT_5X5_250"
+};
+
 }  // namespace booth

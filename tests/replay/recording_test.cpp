@@ -291,6 +291,7 @@ TEST(WriteRigJson, GivesEveryNumberBack) {
   written.cameras[1].role = CameraRole::face;
   written.cameras[1].mount_rotation_deg = 270;
   written.cameras[2].rms_px.reset();
+  written.cameras[1].uncertainty = PoseUncertainty{.center_m = 0.0004, .rotation_rad = 0.00017};
   written.cameras[2].intrinsics.skew = 1.0 / 3.0;
   const ScratchFolder scratch;
   ASSERT_TRUE(write_file_atomically(scratch.path() / "rig.json", write_rig_json(written)));
@@ -314,6 +315,10 @@ TEST(WriteRigJson, GivesEveryNumberBack) {
     EXPECT_EQ(read->cameras[i].role, written.cameras[i].role);
     EXPECT_EQ(read->cameras[i].mount_rotation_deg, written.cameras[i].mount_rotation_deg);
     EXPECT_EQ(read->cameras[i].rms_px, written.cameras[i].rms_px);
+    ASSERT_EQ(read->cameras[i].uncertainty.has_value(), written.cameras[i].uncertainty.has_value());
+    if (!written.cameras[i].uncertainty) continue;
+    EXPECT_EQ(read->cameras[i].uncertainty->center_m, written.cameras[i].uncertainty->center_m);
+    EXPECT_EQ(read->cameras[i].uncertainty->rotation_rad, written.cameras[i].uncertainty->rotation_rad);
   }
   ASSERT_TRUE(read->projector);
   expect_same(*read->projector, *written.projector);
