@@ -1,0 +1,97 @@
+#include "pipeline/face/head_view.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "pipeline/geometry/camera_model.h"
+
+namespace booth {
+namespace {
+
+/// Rec. 709 luma of a pixel.
+float luma(const Image& picture, int x, int y) {
+  const uint8_t* p = picture.pixel(x, y);
+  if (picture.channels == 1) return p[0];
+  constexpr float red = 0.2126F, green = 0.7152F, blue = 0.0722F;
+  return red * static_cast<float>(p[0]) + green * static_cast<float>(p[1]) + blue * static_cast<float>(p[2]);
+}
+
+/// Linear between four pixels; 0 outside.
+float sample(const Image& picture, const Eigen::Vector2d& at) {
+  if (!(at.x() >= 0 && at.y() >= 0 && at.x() <= picture.width - 1 && at.y() <= picture.height - 1)) return 0;
+  const int x = std::min(static_cast<int>(at.x()), picture.width - 2),
+            y = std::min(static_cast<int>(at.y()), picture.height - 2);
+  const auto fx = static_cast<float>(at.x() - x), fy = static_cast<float>(at.y() - y);
+  return (1 - fy) * ((1 - fx) * luma(picture, x, y) + fx * luma(picture, x + 1, y)) +
+         fy * ((1 - fx) * luma(picture, x, y + 1) + fx * luma(picture, x + 1, y + 1));
+}
+
+/// From the view's pixels to the camera's, without a world between.
+class ViewToCamera {
+ public:
+  ViewToCamera(const CalibratedView& camera, const CalibratedView& view)
+      : camera_(camera.intrinsics),
+        view_(view.intrinsics),
+        turn_(camera.camera_from_world.linear() * view.camera_from_world.linear().transpose()) {}
+  std::optional<Eigen::Vector2d> operator()(double x, double y) const {
+    return project_camera_point(camera_,
+                                turn_ * Eigen::Vector3d((x - view_.cx) / view_.fx, (y - view_.cy) / view_.fy, 1));
+  }
+
+ private:
+  const Intrinsics& camera_;
+  const Intrinsics& view_;
+  Eigen::Matrix3d turn_;
+};
+
+}  // namespace
+
+std::optional<CalibratedView> upright_view(const CalibratedView& camera, const Eigen::Vector3d& middle, double width_m,
+                                           int pixels) {
+  const Eigen::Vector3d eye = camera.center(), sight = middle - eye;
+  const double distance = sight.norm();
+  constexpr double steepest = 0.766;  // sin 50°
+  if (!(distance > 0) || std::abs(sight.y()) > steepest * distance) return std::nullopt;
+  const Eigen::Vector3d forward = sight / distance;
+  const Eigen::Vector3d right = forward.cross(Eigen::Vector3d::UnitY()).normalized();
+  CalibratedView view;
+  view.id = camera.id;
+  Eigen::Matrix3d rows;
+  rows << right.transpose(), forward.cross(right).transpose(), forward.transpose();
+  view.camera_from_world.linear() = rows;
+  view.camera_from_world.translation() = -rows * eye;
+  view.intrinsics.width = view.intrinsics.height = pixels;
+  view.intrinsics.fx = view.intrinsics.fy = pixels * distance / width_m;
+  view.intrinsics.cx = view.intrinsics.cy = (pixels - 1) / 2.0;
+  return view;
+}
+
+Image render_view(const CalibratedView& camera, const Image& picture, const CalibratedView& view) {
+  const int width = view.intrinsics.width, height = view.intrinsics.height;
+  Image seen(width, height, 1);
+  if (picture.width < 2 || picture.height < 2) return seen;
+  const ViewToCamera to_camera(camera, view);
+  const auto middle = to_camera(view.intrinsics.cx, view.intrinsics.cy);
+  const auto aside = to_camera(view.intrinsics.cx + 1, view.intrinsics.cy);
+  if (!middle || !aside) return seen;
+  constexpr int most_samples = 8;
+  const int samples =
+      static_cast<int>(std::clamp(std::ceil((*aside - *middle).norm() - 0.25), 1.0, double{most_samples}));
+  for (int y = 0; y < height; ++y)
+    for (int x = 0; x < width; ++x) {
+      float sum = 0;
+      for (int i = 0; i < samples * samples; ++i) {
+        const double across = (i % samples + 0.5) / samples - 0.5, down = (i / samples + 0.5) / samples - 0.5;
+        if (const auto at = to_camera(x + across, y + down)) sum += sample(picture, *at);
+      }
+      seen.at(x, y) = static_cast<uint8_t>(std::lround(sum / static_cast<float>(samples * samples)));
+    }
+  return seen;
+}
+
+std::optional<Eigen::Vector2d> pixel_in_camera(const CalibratedView& camera, const CalibratedView& view,
+                                               const Eigen::Vector2d& pixel) {
+  return ViewToCamera(camera, view)(pixel.x(), pixel.y());
+}
+
+}  // namespace booth
