@@ -19,6 +19,8 @@ constexpr float nan = std::numeric_limits<float>::quiet_NaN();
 constexpr int fine_bits = 4;      // the finest bits' differences are kept to place a pixel between the stripes' edges
 constexpr int steps_per_px = 8;   // of the search for the position, projector pixels
 constexpr int search_steps = 12;  // to each side of the integer position: a bit read wrongly at an edge moves it by one
+constexpr size_t most_bits = 16;  // of a coordinate
+constexpr int candidates = 2 * search_steps + 1;
 constexpr size_t row_grain = 16;  // rows in a piece of parallel work
 constexpr int fewest_lit = 200;   // pixels below which there is nothing to decode
 
@@ -54,6 +56,8 @@ Image to_grey(const Image& image) {
 Result<Sequence> sort_images(std::span<const Frame> frames, const GrayCodePattern& pattern) {
   if (!pattern.columns || !pattern.rows)
     return Error{ErrorCode::unsupported, "the Gray-code sequence has no patterns for both columns and rows"};
+  if (std::max(bits_for(pattern.width), bits_for(pattern.height)) > static_cast<int>(most_bits))
+    return Error{ErrorCode::unsupported, "the Gray-code pattern is wider or higher than 65536 pixels"};
   if (frames.empty()) return Error{ErrorCode::no_subject, "the Gray-code sequence has no images"};
   Sequence sequence;
   sequence.converted.reserve(frames.size());
@@ -117,26 +121,35 @@ class StripeProfiles {
   explicit StripeProfiles(double blur_px) {
     for (int k = 0; k < fine_bits; ++k) {
       std::vector<float>& table = tables_[static_cast<size_t>(k)];
-      const int period = period_px(k);
-      table.resize(static_cast<size_t>(period * steps_per_px));
+      const size_t period = static_cast<size_t>(period_steps(k));
+      table.resize(period + candidates);
       for (size_t i = 0; i < table.size(); ++i)
-        table[i] = static_cast<float>(value(k, static_cast<double>(i) / steps_per_px, blur_px));
+        table[i] = i < period ? static_cast<float>(value(k, static_cast<double>(i) / steps_per_px, blur_px))
+                              : table[i - period];
     }
+    for (int i = 0; i < 2 * edge_reach; ++i)
+      edge_[static_cast<size_t>(i)] =
+          static_cast<float>(std::erf(static_cast<double>(i - edge_reach) / steps_per_px / blur_px / std::numbers::sqrt2));
   }
-  static int period_px(int k) { return 4 << k; }
-  float at(int k, int step) const {  // step counts from the centre of projector pixel 0
-    const std::vector<float>& table = tables_[static_cast<size_t>(k)];
-    return table[static_cast<size_t>(step) & (table.size() - 1)];
+  /// The values at `candidates` steps from `step` on, which counts from the centre of projector pixel 0.
+  const float* from(int k, int step) const {
+    return tables_[static_cast<size_t>(k)].data() + (step & (period_steps(k) - 1));
+  }
+  /// The same of a lone edge towards set, `step` steps from the first candidate to it.
+  const float* edge_from(int step) const {
+    return edge_.data() + std::clamp(step + edge_reach, 0, 2 * edge_reach - candidates);
   }
   /// Mean of the finest bit's absolute value: how the blur is measured.
   static double mean_absolute(double blur_px) {
     const StripeProfiles profiles(blur_px);
     double sum = 0;
-    for (const float v : profiles.tables_[0]) sum += std::abs(v);
-    return sum / static_cast<double>(profiles.tables_[0].size());
+    for (int i = 0; i < period_steps(0); ++i) sum += std::abs(profiles.tables_[0][static_cast<size_t>(i)]);
+    return sum / period_steps(0);
   }
 
  private:
+  static int period_px(int k) { return 4 << k; }
+  static int period_steps(int k) { return period_px(k) * steps_per_px; }
   /// Bit k of the Gray code is set in the middle half of every period, from a quarter of it less half a pixel on: the
   /// sum of the square wave's harmonics, each damped by the Gaussian blur.
   static double value(int k, double x, double blur_px) {
@@ -150,7 +163,9 @@ class StripeProfiles {
     }
     return sum;
   }
+  static constexpr int edge_reach = 4 * candidates;
   std::array<std::vector<float>, fine_bits> tables_;
+  std::array<float, 2 * edge_reach> edge_{};
 };
 
 /// The blur at which the finest stripes have the mean strength that was measured.
@@ -167,12 +182,18 @@ double blur_of(double mean_absolute) {
 struct Reading {
   uint16_t integer = 0;                    ///< projector pixel by the signs of all bits
   std::array<int8_t, fine_bits> relative;  ///< differences of the finest bits, 100 = the contrast
+  /// Where a coarser bit has an edge beside `integer` the finest are mirrored and cannot tell its sides: the pixel that
+  /// the edge lies before, its bit's difference, and whether the bit is set after it. 0: there is none.
+  uint16_t edge = 0;
+  int8_t edge_relative = 0;
+  bool edge_rises = false;
 };
 constexpr float relative_unit = 100;
 
 struct LitPixel {
   uint16_t x = 0;
   float contrast = 0;
+  float noise = 0;  ///< standard deviation of a bit's difference at that pixel, grey levels
   std::array<Reading, 2> axis;
 };
 
@@ -180,10 +201,19 @@ class Decoder {
  public:
   Decoder(const Sequence& sequence, const GrayCodePattern& pattern, const Image* subject,
           const GrayCodeOptions& options, const Work& work)
-      : s_(sequence), work_(work), options_(options), sizes_{pattern.width, pattern.height} {
+      : s_(sequence), work_(work), sizes_{pattern.width, pattern.height}, min_snr_(static_cast<float>(options.min_snr)) {
     if (subject != nullptr) mark_tiles(*subject);
     for (size_t axis = 0; axis < 2; ++axis)
-      for (const BitImages& bit : s_.bits[axis]) complete_ += bit.complete() ? 1 : 0;
+      for (size_t bit = 0; bit < s_.bits[axis].size(); ++bit) {
+        const BitImages& images = s_.bits[axis][bit];
+        if (!images.complete()) continue;
+        ++complete_;
+        if (bit + fine_bits < s_.bits[axis].size()) coarse_.push_back(&images);
+      }
+    if (s_.white != nullptr && s_.black != nullptr) {
+      lit_and_unlit_ = {s_.white, s_.black};
+      coarse_.push_back(&lit_and_unlit_);
+    }
   }
 
   Result<void> run(ProjectorCoordinates* out) {
@@ -220,10 +250,11 @@ class Decoder {
 
  private:
   struct RowBuffers {
-    explicit RowBuffers(size_t width) : lit(width), sum(width), strength(width) {}
-    std::vector<uint16_t> lit;
+    explicit RowBuffers(size_t width) : sum(width), strength(width), drift(width), drift2(width) {}
     std::vector<int16_t> sum;       ///< white + black, or pattern + inverse
     std::vector<int32_t> strength;  ///< sum of the absolute differences of the coarse bits
+    std::vector<int32_t> drift;     ///< sum of what the coarse bits' pattern + inverse differ from `sum`
+    std::vector<int32_t> drift2;    ///< sum of its squares
   };
 
   /// Tiles of the image in or near the subject; the margin leaves room for its movement since it was segmented.
@@ -241,7 +272,8 @@ class Decoder {
           for (int v = std::max(0, y - margin); v <= std::min(rows - 1, y + margin); ++v)
             for (int u = std::max(0, x - margin); u <= std::min(columns - 1, x + margin); ++u) tiles_.at(u, v) = 1;
   }
-  static int tile_of(int pixel) { return pixel / 8; }
+  static constexpr int tile_px = 8;
+  static int tile_of(int pixel) { return pixel / tile_px; }
 
   Result<void> check_bits() const {
     const bool reference = s_.white != nullptr && s_.black != nullptr;
@@ -319,60 +351,121 @@ class Decoder {
       out->motion_px = std::max(out->motion_px, structure.ldlt().solve(moment).norm());
   }
 
-  void read_row(int y, RowBuffers* buffers) {
-    const size_t width = static_cast<size_t>(s_.width);
-    const size_t row = static_cast<size_t>(y) * width;
-    sum_row(y, buffers->sum.data());
-    // Lit where the coarse bits of both axes say so together: their mean difference is steadier than white minus black.
-    int coarse = 0;
-    std::fill(buffers->strength.begin(), buffers->strength.end(), 0);
-    for (const auto& bits : s_.bits)
-      for (size_t bit = 0; bit + fine_bits <= bits.size(); ++bit) {
-        const BitImages& images = bits[bit];
-        if (!images.complete()) continue;
-        ++coarse;
-        const uint8_t *p = images.pattern->samples.data() + row, *q = images.inverse->samples.data() + row;
-        for (size_t x = 0; x < width; ++x) buffers->strength[x] += std::abs(p[x] - q[x]);
+  /// The first and one past the last pixel of a row that may be decoded.
+  std::pair<size_t, size_t> span_of(int y) const {
+    if (tiles_.empty()) return {0, static_cast<size_t>(s_.width)};
+    int first = tiles_.width, last = -1;
+    for (int t = 0; t < tiles_.width; ++t)
+      if (tiles_.at(t, tile_of(y)) != 0) {
+        first = std::min(first, t);
+        last = t;
       }
-    if (s_.white != nullptr && s_.black != nullptr) {
-      ++coarse;
-      const uint8_t *p = s_.white->samples.data() + row, *q = s_.black->samples.data() + row;
-      for (size_t x = 0; x < width; ++x) buffers->strength[x] += std::abs(p[x] - q[x]);
+    if (last < 0) return {0, 0};
+    return {static_cast<size_t>(first * tile_px), static_cast<size_t>(std::min(s_.width, (last + 1) * tile_px))};
+  }
+
+  /// Sums over the coarse bits, whose stripes are wide: how strong their differences are, and how much the sums of
+  /// pattern and inverse vary, which would all be the same without noise.
+  void sum_coarse_bits(int y, size_t first, size_t last, RowBuffers* b) const {
+    const size_t row = static_cast<size_t>(y) * static_cast<size_t>(s_.width);
+    for (auto* sums : {&b->strength, &b->drift, &b->drift2})
+      std::fill(sums->begin() + static_cast<std::ptrdiff_t>(first), sums->begin() + static_cast<std::ptrdiff_t>(last), 0);
+    int32_t *strength = b->strength.data(), *drift = b->drift.data(), *drift2 = b->drift2.data();
+    const int16_t* sum = b->sum.data();
+    for (const BitImages* images : coarse_) {
+      const uint8_t *p = images->pattern->samples.data() + row, *q = images->inverse->samples.data() + row;
+      for (size_t x = first; x < last; ++x) {
+        const int32_t off = p[x] + q[x] - sum[x];
+        strength[x] += std::abs(p[x] - q[x]);
+        drift[x] += off;
+        drift2[x] += off * off;
+      }
     }
-    const float least =
-        static_cast<float>(std::max(options_.min_contrast, options_.min_snr * noise_ * std::numbers::sqrt2));
-    const auto threshold = static_cast<int32_t>(std::ceil(least * static_cast<float>(coarse)));
-    size_t lit = 0;
-    for (size_t x = 0; x < width; ++x) {
-      buffers->lit[lit] = static_cast<uint16_t>(x);
-      const bool near = tiles_.empty() || tiles_.at(tile_of(static_cast<int>(x)), tile_of(y)) != 0;
-      lit += near && buffers->strength[x] >= threshold ? 1 : 0;
+  }
+
+  /// The standard deviation of a bit's difference at a pixel, by how its sums of pattern and inverse vary (a difference
+  /// and a sum of two images have the same noise), steadied by that of the whole image.
+  float noise_at(size_t x, const RowBuffers& b) const {
+    const float count = static_cast<float>(coarse_.size());
+    const float overall = static_cast<float>(2 * noise_ * noise_);
+    if (count < 2) return std::sqrt(overall);
+    const float drift = static_cast<float>(b.drift[x]);
+    const float scatter = static_cast<float>(b.drift2[x]) - drift * drift / count;
+    constexpr float overall_weight = 6;  // as many samples
+    return std::sqrt((overall_weight * overall + scatter) / (overall_weight + count - 1));
+  }
+
+  /// A bit's difference, averaged over the pixels up to `radius` around (x, y).
+  float mean_difference(const BitImages& bit, int x, int y, int radius, const RowBuffers& b) const {
+    const size_t width = static_cast<size_t>(s_.width);
+    if (radius == 0 || !bit.complete())
+      return static_cast<float>(
+          difference(bit, static_cast<size_t>(y) * width + static_cast<size_t>(x), b.sum[static_cast<size_t>(x)]));
+    const int left = std::max(0, x - radius), right = std::min(s_.width - 1, x + radius);
+    const int top = std::max(0, y - radius), bottom = std::min(s_.height - 1, y + radius);
+    int sum = 0;
+    for (int v = top; v <= bottom; ++v) {
+      const uint8_t *p = bit.pattern->pixel(0, v), *q = bit.inverse->pixel(0, v);
+      for (int u = left; u <= right; ++u) sum += p[u] - q[u];
     }
+    return static_cast<float>(sum) / static_cast<float>((right - left + 1) * (bottom - top + 1));
+  }
+
+  /// The coarse bits' mean strength around a pixel.
+  float mean_strength(int x, int y, int radius, const RowBuffers& b) const {
+    float sum = 0;
+    for (const BitImages* bit : coarse_) sum += std::abs(mean_difference(*bit, x, y, radius, b));
+    return sum / static_cast<float>(std::max<size_t>(coarse_.size(), 1));
+  }
+
+  void read_row(int y, RowBuffers* buffers) {
+    const auto [first, last] = span_of(y);
+    sum_row(y, buffers->sum.data());
+    sum_coarse_bits(y, first, last, buffers);
     std::vector<LitPixel>& pixels = rows_[static_cast<size_t>(y)];
-    pixels.resize(lit);
-    for (size_t i = 0; i < lit; ++i) {
-      const size_t x = buffers->lit[i];
-      pixels[i].x = buffers->lit[i];
-      pixels[i].contrast = static_cast<float>(buffers->strength[x]) / static_cast<float>(coarse);
+    for (size_t i = first; i < last; ++i) {
+      const int x = static_cast<int>(i);
+      if (!tiles_.empty() && tiles_.at(tile_of(x), tile_of(y)) == 0) continue;
+      LitPixel pixel;
+      pixel.x = static_cast<uint16_t>(x);
+      pixel.noise = noise_at(i, *buffers);
+      // What is too dim by itself (dark skin and hair, grazing light) its surroundings may make out.
+      int radius = 0;
+      pixel.contrast = static_cast<float>(buffers->strength[i]) / static_cast<float>(std::max<size_t>(coarse_.size(), 1));
+      constexpr float certain_snr = 4;
+      constexpr int widest = 2;
+      while (pixel.contrast < (radius == 0 ? certain_snr : min_snr_) * pixel.noise / static_cast<float>(2 * radius + 1) &&
+             radius <= widest)
+        if (++radius <= widest) pixel.contrast = mean_strength(x, y, radius, *buffers);
+      if (radius > widest) continue;
+      read_bits(y, radius, *buffers, &pixel);
+      pixels.push_back(pixel);
     }
+  }
+
+  void read_bits(int y, int radius, const RowBuffers& buffers, LitPixel* pixel) const {
+    const float scale = relative_unit / pixel->contrast;
+    const auto relative = [&](float d) { return static_cast<int8_t>(std::clamp(d * scale, -127.0F, 127.0F)); };
     for (size_t axis = 0; axis < 2; ++axis) {
       const auto& bits = s_.bits[axis];
-      for (size_t i = 0; i < lit; ++i) {
-        LitPixel& pixel = pixels[i];
-        const size_t at = row + pixel.x;
-        const int sum = buffers->sum[pixel.x];
-        const float scale = relative_unit / pixel.contrast;
-        unsigned value = 0, previous = 0;
-        for (size_t bit = 0; bit < bits.size(); ++bit) {
-          const int d = difference(bits[bit], at, sum);
-          previous ^= d > 0 ? 1U : 0U;  // a Gray bit is the binary bit's change from the one before it
-          value = value << 1 | previous;
-          if (bit + fine_bits >= bits.size())
-            pixel.axis[axis].relative[bits.size() - 1 - bit] =
-                static_cast<int8_t>(std::clamp(static_cast<float>(d) * scale, -127.0F, 127.0F));
-        }
-        pixel.axis[axis].integer = static_cast<uint16_t>(value);
+      Reading& reading = pixel->axis[axis];
+      std::array<float, most_bits> d{};  // from the finest
+      unsigned value = 0, previous = 0;
+      for (size_t bit = bits.size(); bit-- > 0;) {
+        d[bit] = mean_difference(bits[bits.size() - 1 - bit], pixel->x, y, radius, buffers);
+        previous ^= d[bit] > 0 ? 1U : 0U;  // a Gray bit is the binary bit's change from the one before it
+        value = value << 1 | previous;
+        if (bit < fine_bits) reading.relative[bit] = relative(d[bit]);
       }
+      reading.integer = static_cast<uint16_t>(value);
+      constexpr unsigned coarse = 1U << fine_bits;
+      const unsigned edge = (value + 2) & ~(coarse - 1);  // the only one that can be within two pixels
+      if (edge == 0 || edge + 1 < value) continue;
+      const auto bit = static_cast<size_t>(std::countr_zero(edge));
+      if (bit >= bits.size() || bits[bits.size() - 1 - bit].missing()) continue;
+      reading.edge = static_cast<uint16_t>(edge);
+      reading.edge_relative = relative(d[bit]);
+      reading.edge_rises = ((edge ^ edge >> 1) >> bit & 1U) != 0;
     }
   }
 
@@ -381,7 +474,7 @@ class Decoder {
     double sum = 0, count = 0;
     for (const auto& row : rows_)
       for (const LitPixel& pixel : row)
-        if (pixel.contrast > 4 * noise_) {
+        if (pixel.contrast > 4 * pixel.noise) {
           sum += std::abs(pixel.axis[axis].relative[0]) / relative_unit;
           ++count;
         }
@@ -404,13 +497,13 @@ class Decoder {
       if (!good) continue;
       raw_.at(pixel.x, y, 0) = position[0];
       raw_.at(pixel.x, y, 1) = position[1];
-      weight_.at(pixel.x, y) = information * pixel.contrast * pixel.contrast;
+      const float snr = pixel.contrast / pixel.noise;
+      weight_.at(pixel.x, y) = information * snr * snr;
     }
   }
 
   /// The position near the integer one at which the profiles explain the finest differences best.
   float place(const Reading& reading, size_t axis, const StripeProfiles& profiles, float* information) const {
-    constexpr int candidates = 2 * search_steps + 1;
     std::array<float, candidates> cost{};
     const int center = reading.integer * steps_per_px;
     const auto& bits = s_.bits[axis];
@@ -420,9 +513,20 @@ class Decoder {
       const float measured = static_cast<float>(reading.relative[static_cast<size_t>(k)]) / relative_unit;
       // One bit off is one outlier, not four times its weight.
       constexpr float most = 0.5F;
-      for (int j = 0; j < candidates; ++j) {
-        const float off = measured - profiles.at(k, center + j - search_steps);
-        cost[static_cast<size_t>(j)] += std::min(off * off, most);
+      const float* expected = profiles.from(k, center - search_steps);
+      for (size_t j = 0; j < candidates; ++j) {
+        const float off = measured - expected[j];
+        cost[j] += std::min(off * off, most);
+      }
+    }
+    if (reading.edge != 0) {
+      const float sign = reading.edge_rises ? 1.0F : -1.0F;
+      const float measured = sign * static_cast<float>(reading.edge_relative) / relative_unit;
+      const float* expected =
+          profiles.edge_from(center - search_steps - (reading.edge * steps_per_px - steps_per_px / 2));
+      for (size_t j = 0; j < candidates; ++j) {
+        const float off = measured - expected[j];
+        cost[j] += off * off;
       }
     }
     int best = 1;
@@ -470,19 +574,24 @@ class Decoder {
   struct PlaneFit {
     Eigen::Matrix3f moments = Eigen::Matrix3f::Zero();
     Eigen::Matrix<float, 3, 2> right = Eigen::Matrix<float, 3, 2>::Zero();
+    float squares = 0;  ///< weighted sum of the squared steps
     int continuing = 0;
   };
-  PlaneFit fit_around(int x, int y, const Eigen::Vector2f& center) const {
-    constexpr float most_slope = 3;  // times the usual step: steeper is another surface
-    constexpr float tolerance = 1.2F;
+  using Plane = Eigen::Matrix<float, 3, 2>;  ///< a step at (u, v) from a pixel: (1, u, v) times this
+
+  /// @param near    a step that a pixel (u, v) away must come close to
+  /// @param reach   within how much, projector pixels
+  template <class Near, class Reach>
+  PlaneFit fit_around(int x, int y, const Eigen::Vector2f& center, const Near& near, const Reach& reach) const {
     PlaneFit fit;
     float s = 0, su = 0, sv = 0, suu = 0, suv = 0, svv = 0;
     Eigen::Vector2f b = Eigen::Vector2f::Zero(), bu = b, bv = b;
     for_each_around(x, y, [&](int u, int v, const Eigen::Vector2f& position) {
       const Eigen::Vector2f step = position - center;
       const float fu = static_cast<float>(u), fv = static_cast<float>(v);
-      const float reach = tolerance + most_slope * scale_ * std::max(std::abs(fu), std::abs(fv));
-      if (std::abs(step.x()) > reach || std::abs(step.y()) > reach) return;
+      const Eigen::Vector2f off = step - near(fu, fv);
+      const float most = reach(fu, fv);
+      if (std::abs(off.x()) > most || std::abs(off.y()) > most) return;
       ++fit.continuing;
       const float w = weight_.at(x + u, y + v);
       s += w;
@@ -494,12 +603,40 @@ class Decoder {
       b += w * step;
       bu += w * fu * step;
       bv += w * fv * step;
+      fit.squares += w * step.squaredNorm();
     });
     fit.moments << s, su, sv, su, suu, suv, sv, suv, svv;
     fit.right.row(0) = b;
     fit.right.row(1) = bu;
     fit.right.row(2) = bv;
     return fit;
+  }
+  PlaneFit fit_around(int x, int y, const Eigen::Vector2f& center) const {
+    constexpr float tolerance = 0.6F, per_pixel = 0.15F;
+    Plane plane = Plane::Zero();
+    plane.row(1) = slope(x, y, 1, 0, center);
+    plane.row(2) = slope(x, y, 0, 1, center);
+    return fit_around(
+        x, y, center, [&](float u, float v) { return Eigen::Vector2f(u * plane.row(1) + v * plane.row(2)); },
+        [&](float u, float v) { return tolerance + per_pixel * std::max(std::abs(u), std::abs(v)); });
+  }
+
+  /// The change of position a pixel towards (u, v): of both sides the gentler, as beyond an edge it leaps.
+  Eigen::RowVector2f slope(int x, int y, int u, int v, const Eigen::Vector2f& center) const {
+    constexpr int reach = 2;
+    Eigen::RowVector2f gentler = Eigen::RowVector2f::Zero();
+    float least = std::numeric_limits<float>::infinity();
+    for (const int side : {-reach, reach}) {
+      const int there_x = x + side * u, there_y = y + side * v;
+      if (there_x < 0 || there_y < 0 || there_x >= s_.width || there_y >= s_.height) continue;
+      const float* position = raw_.pixel(there_x, there_y);
+      const Eigen::RowVector2f step = (Eigen::RowVector2f(position[0], position[1]) - center.transpose()) / side;
+      if (step.norm() >= least || std::isnan(step.x())) continue;
+      least = step.norm();
+      gentler = step;
+    }
+    constexpr float most_slope = 3;  // times the usual step: steeper is another surface
+    return least <= most_slope * scale_ ? gentler : Eigen::RowVector2f::Zero();
   }
 
   /// The median of the positions around a pixel, each axis by itself.
@@ -538,16 +675,30 @@ class Decoder {
         fit = fit_around(x, y, center);
         if (!enough(fit.continuing)) continue;
       }
-      const Eigen::Matrix3f inverse = fit.moments.inverse();
+      Eigen::Matrix3f inverse = fit.moments.inverse();
+      Plane plane = inverse * fit.right;
+      // Where the plane explains its pixels badly there is an edge or a wrong bit among them: those near it once more.
+      constexpr float usual_residual_px = 0.2F;
+      const float residual2 = (fit.squares - plane.cwiseProduct(fit.right).sum()) / fit.moments(0, 0);
+      if (residual2 > usual_residual_px * usual_residual_px) {
+        const float most = std::max(2 * usual_residual_px, std::sqrt(residual2));
+        const PlaneFit again = fit_around(
+            x, y, center, [&](float u, float v) { return Eigen::Vector2f(Eigen::RowVector3f(1, u, v) * plane); },
+            [&](float, float) { return most; });
+        if (enough(again.continuing)) {
+          fit = again;
+          inverse = fit.moments.inverse();
+          plane = inverse * fit.right;
+        }
+      }
       const float variance = inverse(0, 0);
       if (!(variance > 0) || !std::isfinite(variance)) continue;
-      const Eigen::RowVector2f offset = inverse.row(0) * fit.right;
+      const Eigen::RowVector2f offset = plane.row(0);
       constexpr float spike = 1.5F;
       if (!(offset.cwiseAbs().maxCoeff() < spike)) continue;
       out->position.at(x, y, 0) = center.x() + offset.x();
       out->position.at(x, y, 1) = center.y() + offset.y();
-      // The weights are contrast² × slope²: with the noise of a difference of two images they are 1 / variance.
-      const float sigma = static_cast<float>(noise_ * std::numbers::sqrt2) * std::sqrt(variance);
+      const float sigma = std::sqrt(variance);  // the weights are slope² × contrast² / noise²
       constexpr float model_error = 0.03F;  // of blur that varies over the image, projector pixels
       out->sigma.at(x, y, 0) = out->sigma.at(x, y, 1) = std::hypot(sigma, model_error);
     }
@@ -555,9 +706,11 @@ class Decoder {
 
   const Sequence& s_;
   const Work& work_;
-  const GrayCodeOptions& options_;
   std::array<int, 2> sizes_;
   int complete_ = 0;
+  BitImages lit_and_unlit_;
+  std::vector<const BitImages*> coarse_;  ///< complete ones whose stripes are wide, lit and unlit among them
+  float min_snr_;
   double noise_ = 0;
   double blur_ = 0;
   float scale_ = 1;

@@ -13,8 +13,9 @@
 namespace booth {
 
 struct GrayCodeOptions {
-  double min_contrast = 2.0;  ///< grey levels between lit and unlit below which a pixel is not decoded, 1 … 255
-  double min_snr = 1.0;       ///< the same, in standard deviations of the difference of two images, 0 … 100
+  /// Between lit and unlit, in standard deviations of a bit's difference, averaged over as many pixels as it is read
+  /// from: below that a pixel is not decoded, 1 … 100.
+  double min_snr = 3.0;
 };
 
 /// Which point of the projector's image lights each pixel of a camera.
