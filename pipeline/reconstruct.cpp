@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "pipeline/face/field_fusion.h"
+#include "pipeline/geometry/solid_parts.h"
 #include "pipeline/image/develop.h"
 #include "pipeline/surface/marching_cubes.h"
 
@@ -123,32 +124,31 @@ Result<SegmentedViews> segment_all(const CaptureFrames& capture, std::span<const
 
 /// The face's scan, cleaned and joined to a mesh.
 struct FaceSurface {
+  HeadRegion head;  ///< of the hull
   ScanMesh scan;
   Eigen::Vector3f eye;  ///< where it was seen from, world frame
 };
 
-Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Silhouette> silhouettes,
+Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Silhouette> silhouettes, const Field& hull,
                               const ReconstructionOptions& options, const Work& work,
                               std::vector<std::string>* warnings) {
-  auto scanned = scan_structured_light(capture.rig, *capture.face, silhouettes, options.structured_light, work);
+  const auto head = find_head(extract_surface(hull, work));
+  if (!head) return Error{ErrorCode::no_subject, "no head was found"};
+  auto scanned =
+      scan_structured_light(capture.rig, *capture.face, silhouettes, head->box(), options.structured_light, work);
   if (!scanned) return scanned.error();
   warnings->insert(warnings->end(), scanned->warnings.begin(), scanned->warnings.end());
   auto meshed = mesh_scan(scanned->scan, {}, work);
   if (!meshed) return meshed.error();
-  return FaceSurface{std::move(*meshed), scanned->eye};
+  return FaceSurface{*head, std::move(*meshed), scanned->eye};
 }
 
 /// The closed surface within its budget of triangles, with the face's scan where there is one that meets it.
 Mesh make_surface(const Field& field, const FaceSurface* face, const ReconstructionOptions& options, const Work& work,
                   std::vector<std::string>* warnings) {
-  Mesh mesh = extract_surface(field, work);
-  const auto head = face != nullptr ? find_head(mesh) : std::nullopt;
-  if (head && options.face_merge.method == FaceMergeMethod::sight)
-    mesh = keep_largest_part(extract_surface(fuse_scan(field, *head, face->scan, face->eye, work), work));
-  mesh = smooth_hc(mesh, options.smoothing, work);
+  const Mesh mesh = smooth_hc(extract_surface(field, work), options.smoothing, work);
   if (face == nullptr) return decimate(mesh, options.decimation, work);
-  auto merged = head ? merge_face(mesh, *head, face->scan, face->eye, options.face_merge, work)
-                     : Result<FaceMerge>(Error{ErrorCode::no_subject, "no head was found"});
+  auto merged = merge_face(mesh, face->head, face->scan, face->eye, options.face_merge, work);
   if (!merged) {
     warnings->push_back("the face is the hull's own: " + merged.error().message);
     return decimate(mesh, options.decimation, work);
@@ -239,7 +239,6 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
   {
     const StageReport report("refine", work, progress);
     hull.field = refine_shape(std::move(hull.field), hull.views, options.refinement, report.work());
-    remove_small_handles(hull.field, options.handles, report.work());
     hull.views.clear();
     if (work.stopped()) return Work::cancelled();
   }
@@ -248,7 +247,7 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
   {
     const StageReport report("face", work, progress);
     if (wants_scan(options.face) && capture.face) {
-      auto scanned = scan_face(capture, views.silhouettes, options, report.work(), &warnings);
+      auto scanned = scan_face(capture, views.silhouettes, hull.field, options, report.work(), &warnings);
       if (work.stopped()) return Work::cancelled();
       if (scanned)
         face = std::move(*scanned);
@@ -264,6 +263,11 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
   Avatar& avatar = result.avatar;
   {
     const StageReport report("surface", work, progress);
+    if (face && options.face_merge.method == FaceMergeMethod::sight) {
+      hull.field = fuse_scan(hull.field, face->head, face->scan, face->eye, report.work());
+      keep_largest_part(hull.field, report.work());
+    }
+    remove_small_handles(hull.field, options.handles, report.work());
     avatar.mesh = make_surface(hull.field, face ? &*face : nullptr, options, report.work(), &warnings);
     hull.field = {};
     if (work.stopped()) return Work::cancelled();

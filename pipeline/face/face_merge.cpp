@@ -4,6 +4,7 @@
 #include <Eigen/SparseCholesky>
 #include <Eigen/SparseCore>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <functional>
 #include <limits>
@@ -340,13 +341,69 @@ Result<FaceMerge> merge_radially(const Mesh& hull, const HeadRegion& head, const
   return out;
 }
 
+/// The triangles above a height with their vertices, apart from the rest of a mesh.
+struct UpperPart {
+  Mesh mesh;
+  std::vector<uint32_t> vertex_of;             ///< in the whole mesh, of the part's vertices
+  std::vector<std::array<uint32_t, 3>> below;  ///< the other triangles, of the whole mesh's vertices
+};
+UpperPart part_above(const Mesh& whole, float y) {
+  constexpr uint32_t none = std::numeric_limits<uint32_t>::max();
+  UpperPart part;
+  std::vector<uint32_t> renamed(whole.positions.size(), none);
+  const auto rename = [&](uint32_t v) {
+    if (renamed[v] == none) {
+      renamed[v] = static_cast<uint32_t>(part.vertex_of.size());
+      part.vertex_of.push_back(v);
+      part.mesh.positions.push_back(whole.positions[v]);
+    }
+    return renamed[v];
+  };
+  for (const auto& triangle : whole.triangles) {
+    const auto& [a, b, c] = triangle;
+    if (std::max({whole.positions[a].y(), whole.positions[b].y(), whole.positions[c].y()}) > y)
+      part.mesh.triangles.push_back({rename(a), rename(b), rename(c)});
+    else
+      part.below.push_back(triangle);
+  }
+  return part;
+}
+
+/// Puts a part that was split and moved back into the whole mesh: its first vertices are those that it had.
+FaceMerge put_back(const Mesh& whole, const UpperPart& part, FaceMerge merged) {
+  FaceMerge out;
+  out.moved_m2 = merged.moved_m2;
+  out.mesh.positions = whole.positions;
+  out.face.assign(whole.positions.size(), 0);
+  std::vector<uint32_t> vertex_of = part.vertex_of;
+  for (size_t v = 0; v < merged.mesh.positions.size(); ++v)
+    if (v < part.vertex_of.size()) {
+      out.mesh.positions[vertex_of[v]] = merged.mesh.positions[v];
+      out.face[vertex_of[v]] = merged.face[v];
+    } else {
+      vertex_of.push_back(static_cast<uint32_t>(out.mesh.positions.size()));
+      out.mesh.positions.push_back(merged.mesh.positions[v]);
+      out.face.push_back(merged.face[v]);
+    }
+  out.mesh.triangles = part.below;
+  for (const auto& [a, b, c] : merged.mesh.triangles)
+    out.mesh.triangles.push_back({vertex_of[a], vertex_of[b], vertex_of[c]});
+  return out;
+}
+
 }  // namespace
 
 Result<FaceMerge> merge_face(const Mesh& hull, const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye,
                              const FaceMergeOptions& options, const Work& work) {
   if (scan.mesh.triangles.empty()) return Error{ErrorCode::no_subject, "the scan is empty"};
-  if (options.method == FaceMergeMethod::radial) return merge_radially(hull, head, scan, options, work);
-  return merge_by_sight(hull, head, scan, eye, options, work);
+  // Nothing moves below the bridge under the lowest height of a face; a little more keeps its neighbours' neighbours.
+  constexpr float margin_m = 0.02F;
+  const float bridge = static_cast<float>(options.bridge) * head.height();
+  const UpperPart part = part_above(hull, head.lowest_face_y() - bridge - margin_m);
+  auto merged = options.method == FaceMergeMethod::radial ? merge_radially(part.mesh, head, scan, options, work)
+                                                          : merge_by_sight(part.mesh, head, scan, eye, options, work);
+  if (!merged) return merged.error();
+  return put_back(hull, part, *std::move(merged));
 }
 
 }  // namespace booth

@@ -5,7 +5,6 @@
 #include <array>
 #include <cmath>
 #include <limits>
-#include <numeric>
 #include <vector>
 
 #include "pipeline/face/ray_caster.h"
@@ -127,34 +126,6 @@ Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan
     out.set_brick(brick, next++);
   }
   return out;
-}
-
-Mesh keep_largest_part(const Mesh& mesh) {
-  std::vector<uint32_t> parent(mesh.positions.size());
-  std::iota(parent.begin(), parent.end(), 0U);
-  const auto find = [&](uint32_t v) {
-    while (parent[v] != v) v = parent[v] = parent[parent[v]];
-    return v;
-  };
-  for (const auto& [a, b, c] : mesh.triangles) {
-    parent[find(b)] = find(a);
-    parent[find(c)] = find(a);
-  }
-  std::vector<double> area(mesh.positions.size(), 0);
-  for (const auto& [a, b, c] : mesh.triangles)
-    area[find(a)] += static_cast<double>(
-        (mesh.positions[b] - mesh.positions[a]).cross(mesh.positions[c] - mesh.positions[a]).norm());
-  const auto largest = static_cast<uint32_t>(std::max_element(area.begin(), area.end()) - area.begin());
-  Mesh kept;
-  std::vector<uint32_t> renamed(mesh.positions.size(), 0);
-  for (uint32_t v = 0; v < mesh.positions.size(); ++v)
-    if (find(v) == largest) {
-      renamed[v] = static_cast<uint32_t>(kept.positions.size());
-      kept.positions.push_back(mesh.positions[v]);
-    }
-  for (const auto& [a, b, c] : mesh.triangles)
-    if (find(a) == largest) kept.triangles.push_back({renamed[a], renamed[b], renamed[c]});
-  return kept;
 }
 
 }  // namespace booth

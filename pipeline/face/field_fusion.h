@@ -19,13 +19,10 @@ namespace booth {
 /// @param field  as carve_visual_hull returns it
 /// @param eye    world frame, metres: where the scan was seen from
 /// @return the field with the scan's surface in it to about a tenth of a voxel, metres where stored. Its zero level may
-///         have closed-off cavities; keep_largest_part drops their surface
+///         have closed-off cavities and loose parts, see solid_parts.h
 /// Source: Y. Yemez, C. Wetherilt, "A volumetric fusion technique for surface reconstruction from silhouettes and range
 /// data", CVIU 105(1), 2007.
 Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye,
                 const Work& work = {});
-
-/// The connected part of a mesh with the largest area.
-Mesh keep_largest_part(const Mesh& mesh);
 
 }  // namespace booth

@@ -1,6 +1,6 @@
 #pragma once
 
-#include <Eigen/Core>
+#include <Eigen/Geometry>
 #include <optional>
 
 #include "pipeline/types/mesh.h"
@@ -15,6 +15,12 @@ struct HeadRegion {
   float height() const { return crown_y - neck_y; }
   /// Height down to which a scan is used: chin and throat hide where the neck begins.
   float lowest_face_y() const { return neck_y - 0.1F * height(); }
+  /// What holds the head with its hair, down to the lowest height of a face.
+  Eigen::AlignedBox3d box() const {
+    const float half = 0.8F * height();
+    return {Eigen::Vector3d(barycentre.x() - half, lowest_face_y(), barycentre.z() - half),
+            Eigen::Vector3d(barycentre.x() + half, crown_y + 0.1F * height(), barycentre.z() + half)};
+  }
 };
 
 /// The head of a standing person by proportions: the narrowest place of the body between 8 and 25 % of the stature

@@ -20,6 +20,12 @@ void average_noise(const RangeScan& scan, const ScanMeshOptions& options, const 
   const int radius = options.smoothing_radius;
   const float gap = static_cast<float>(options.most_gap_m);
   const float spread = 0.5F * static_cast<float>(radius);
+  const int side = 2 * radius + 1;
+  std::vector<float> kernel(static_cast<size_t>(side * side));
+  for (int v = -radius; v <= radius; ++v)
+    for (int u = -radius; u <= radius; ++u)
+      kernel[static_cast<size_t>((v + radius) * side + u + radius)] =
+          std::exp(-0.5F * static_cast<float>(u * u + v * v) / (spread * spread));
   work.parallel_for(static_cast<size_t>(scan.height), row_grain, [&](size_t begin, size_t end) {
     for (int y = static_cast<int>(begin); y < static_cast<int>(end); ++y)
       for (int x = 0; x < scan.width; ++x) {
@@ -38,8 +44,8 @@ void average_noise(const RangeScan& scan, const ScanMeshOptions& options, const 
             const Eigen::Vector3f step = scan.points[j] - own;
             if (step.squaredNorm() > gap * gap) continue;
             ++around;
-            const float w = std::exp(-0.5F * static_cast<float>(u * u + v * v) / (spread * spread)) /
-                            (scan.sigma_m[j] * scan.sigma_m[j]);
+            const float w =
+                kernel[static_cast<size_t>((v + radius) * side + u + radius)] / (scan.sigma_m[j] * scan.sigma_m[j]);
             sum += w;
             mean += w * step;
             second += w * step * step.transpose();

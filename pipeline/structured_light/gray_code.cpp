@@ -128,8 +128,8 @@ class StripeProfiles {
                               : table[i - period];
     }
     for (int i = 0; i < 2 * edge_reach; ++i)
-      edge_[static_cast<size_t>(i)] =
-          static_cast<float>(std::erf(static_cast<double>(i - edge_reach) / steps_per_px / blur_px / std::numbers::sqrt2));
+      edge_[static_cast<size_t>(i)] = static_cast<float>(
+          std::erf(static_cast<double>(i - edge_reach) / steps_per_px / blur_px / std::numbers::sqrt2));
   }
   /// The values at `candidates` steps from `step` on, which counts from the centre of projector pixel 0.
   const float* from(int k, int step) const {
@@ -201,7 +201,10 @@ class Decoder {
  public:
   Decoder(const Sequence& sequence, const GrayCodePattern& pattern, const Image* subject,
           const GrayCodeOptions& options, const Work& work)
-      : s_(sequence), work_(work), sizes_{pattern.width, pattern.height}, min_snr_(static_cast<float>(options.min_snr)) {
+      : s_(sequence),
+        work_(work),
+        sizes_{pattern.width, pattern.height},
+        min_snr_(static_cast<float>(options.min_snr)) {
     if (subject != nullptr) mark_tiles(*subject);
     for (size_t axis = 0; axis < 2; ++axis)
       for (size_t bit = 0; bit < s_.bits[axis].size(); ++bit) {
@@ -234,7 +237,7 @@ class Decoder {
     raw_ = FloatImage(s_.width, s_.height, 2, nan);
     weight_ = FloatImage(s_.width, s_.height, 1, 0);
     out->position = FloatImage(s_.width, s_.height, 2, nan);
-    out->sigma = FloatImage(s_.width, s_.height, 2, std::numeric_limits<float>::infinity());
+    out->sigma = FloatImage(s_.width, s_.height, 1, std::numeric_limits<float>::infinity());
     work_.parallel_for(rows_.size(), row_grain, [&](size_t begin, size_t end) {
       for (size_t y = begin; y < end && !work_.stopped(); ++y) place_row(static_cast<int>(y), profiles);
     });
@@ -369,7 +372,8 @@ class Decoder {
   void sum_coarse_bits(int y, size_t first, size_t last, RowBuffers* b) const {
     const size_t row = static_cast<size_t>(y) * static_cast<size_t>(s_.width);
     for (auto* sums : {&b->strength, &b->drift, &b->drift2})
-      std::fill(sums->begin() + static_cast<std::ptrdiff_t>(first), sums->begin() + static_cast<std::ptrdiff_t>(last), 0);
+      std::fill(sums->begin() + static_cast<std::ptrdiff_t>(first), sums->begin() + static_cast<std::ptrdiff_t>(last),
+                0);
     int32_t *strength = b->strength.data(), *drift = b->drift.data(), *drift2 = b->drift2.data();
     const int16_t* sum = b->sum.data();
     for (const BitImages* images : coarse_) {
@@ -431,10 +435,12 @@ class Decoder {
       pixel.noise = noise_at(i, *buffers);
       // What is too dim by itself (dark skin and hair, grazing light) its surroundings may make out.
       int radius = 0;
-      pixel.contrast = static_cast<float>(buffers->strength[i]) / static_cast<float>(std::max<size_t>(coarse_.size(), 1));
+      pixel.contrast =
+          static_cast<float>(buffers->strength[i]) / static_cast<float>(std::max<size_t>(coarse_.size(), 1));
       constexpr float certain_snr = 4;
       constexpr int widest = 2;
-      while (pixel.contrast < (radius == 0 ? certain_snr : min_snr_) * pixel.noise / static_cast<float>(2 * radius + 1) &&
+      while (pixel.contrast <
+                 (radius == 0 ? certain_snr : min_snr_) * pixel.noise / static_cast<float>(2 * radius + 1) &&
              radius <= widest)
         if (++radius <= widest) pixel.contrast = mean_strength(x, y, radius, *buffers);
       if (radius > widest) continue;
@@ -699,8 +705,8 @@ class Decoder {
       out->position.at(x, y, 0) = center.x() + offset.x();
       out->position.at(x, y, 1) = center.y() + offset.y();
       const float sigma = std::sqrt(variance);  // the weights are slope² × contrast² / noise²
-      constexpr float model_error = 0.03F;  // of blur that varies over the image, projector pixels
-      out->sigma.at(x, y, 0) = out->sigma.at(x, y, 1) = std::hypot(sigma, model_error);
+      constexpr float model_error = 0.03F;      // of blur that varies over the image, projector pixels
+      out->sigma.at(x, y) = std::hypot(sigma, model_error);
     }
   }
 

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <Eigen/Core>
 #include <span>
 #include <string>
 #include <vector>
@@ -21,8 +22,9 @@ struct GrayCodeOptions {
 /// Which point of the projector's image lights each pixel of a camera.
 struct ProjectorCoordinates {
   std::string camera;
+  Eigen::Vector2i origin{0, 0};       ///< the camera's pixel that (0, 0) of `position` and `sigma` is
   FloatImage position;                ///< 2 channels: column and row in projector pixels, NaN where nothing was decoded
-  FloatImage sigma;                   ///< 2 channels: their standard deviations, projector pixels
+  FloatImage sigma;                   ///< their standard deviation, projector pixels
   size_t decoded = 0;                 ///< pixels with a position
   double blur_px = 0;                 ///< standard deviation of the stripes' blur, projector pixels
   double noise = 0;                   ///< standard deviation of one image, grey levels

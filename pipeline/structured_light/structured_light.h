@@ -1,6 +1,6 @@
 #pragma once
 
-#include <Eigen/Core>
+#include <Eigen/Geometry>
 #include <span>
 #include <string>
 #include <vector>
@@ -40,6 +40,7 @@ struct StructuredLightScan {
 /// From the images of a Gray-code shot to the surface that the projector lights.
 ///
 /// @param silhouettes  of the body shot, where there are any: what lies well away from the subject is not decoded
+/// @param region       world frame, metres: what lies outside is not decoded; the rig's volume is enough
 /// A camera that cannot be decoded is left out with a warning.
 /// @error no_subject       no camera could be decoded, too few points are left, or the subject moved too far; the
 /// message
@@ -47,6 +48,7 @@ struct StructuredLightScan {
 /// @error too_few_views, invalid_argument  as triangulate
 Result<StructuredLightScan> scan_structured_light(const Rig& rig, const GrayCodeCapture& capture,
                                                   std::span<const Silhouette> silhouettes,
+                                                  const Eigen::AlignedBox3d& region,
                                                   const StructuredLightOptions& options = {}, const Work& work = {});
 
 }  // namespace booth

@@ -58,7 +58,7 @@ FloatImage invert(const ProjectorCoordinates& view, int width, int height) {
     constexpr float grazing = 0.02F;
     if (std::abs(area) < grazing) return;
     float sigma = 0;
-    for (const Eigen::Vector2i& at : pixel) sigma = std::max(sigma, view.sigma.at(at.x(), at.y(), 0));
+    for (const Eigen::Vector2i& at : pixel) sigma = std::max(sigma, view.sigma.at(at.x(), at.y()));
     sigma /= std::sqrt(std::abs(area));
     const Eigen::Vector2f low = p[0].cwiseMin(p[1]).cwiseMin(p[2]), high = p[0].cwiseMax(p[1]).cwiseMax(p[2]);
     for (int y = std::max(0, static_cast<int>(std::ceil(low.y()))); y <= static_cast<int>(high.y()) && y < height; ++y)
@@ -72,8 +72,8 @@ FloatImage invert(const ProjectorCoordinates& view, int width, int height) {
         if (out[2] <= sigma) continue;  // a pixel seen twice (false positions do that) goes to the surer; NaN gives way
         const Eigen::Vector2f at = pixel[0].cast<float>() + b1 * (pixel[1] - pixel[0]).cast<float>() +
                                    b2 * (pixel[2] - pixel[0]).cast<float>();
-        out[0] = at.x();
-        out[1] = at.y();
+        out[0] = at.x() + static_cast<float>(view.origin.x());
+        out[1] = at.y() + static_cast<float>(view.origin.y());
         out[2] = sigma;
       }
   };

@@ -7,6 +7,7 @@
 
 #include "pipeline/face/field_fusion.h"
 #include "pipeline/face/subdivision.h"
+#include "pipeline/geometry/solid_parts.h"
 #include "pipeline/surface/decimation.h"
 #include "pipeline/surface/marching_cubes.h"
 #include "pipeline/thread_pool.h"
@@ -55,8 +56,10 @@ const Scene& scene() {
   return made;
 }
 
-Mesh fused() {
-  return keep_largest_part(extract_surface(fuse_scan(scene().hull, scene().head, scene().scan, scene().eye)));
+Mesh fused(const Field& hull = scene().hull) {
+  Field field = fuse_scan(hull, scene().head, scene().scan, scene().eye);
+  keep_largest_part(field);
+  return extract_surface(field);
 }
 
 /// Of the vertices that lie well inside the scan's reach, the largest distance from the true surface.
@@ -108,7 +111,7 @@ TEST(FuseScan, FillsWhereASilhouetteCutTooDeep) {
         }
       }
   ASSERT_GT(cut, 0U);
-  const Mesh mesh = keep_largest_part(extract_surface(fuse_scan(grooved, scene().head, scene().scan, scene().eye)));
+  const Mesh mesh = fused(grooved);
   EXPECT_LT(worst_on_face(mesh), 0.004);
 }
 

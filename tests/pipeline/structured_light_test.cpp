@@ -36,7 +36,7 @@ Errors errors_of(const StructuredLightScan& scan, const Eigen::Vector3d& moved =
 }
 
 Result<StructuredLightScan> scan(const Rig& rig, const GrayCodeCapture& capture) {
-  return scan_structured_light(rig, capture, {});
+  return scan_structured_light(rig, capture, {}, rig.volume);
 }
 
 const Rig& rig() {
@@ -137,7 +137,7 @@ TEST(StructuredLight, TellsMovementAndRefusesTooMuch) {
   EXPECT_LT(errors_of(*swayed, 0.5 * sway).median_m, 0.001);
   StructuredLightOptions strict;
   strict.most_motion_m = 0.0005;
-  const auto moved = scan_structured_light(rig(), capture, {}, strict);
+  const auto moved = scan_structured_light(rig(), capture, {}, rig().volume, strict);
   ASSERT_FALSE(moved.ok());
   EXPECT_THAT(moved.error().message, HasSubstr("moved"));
 }
@@ -174,7 +174,7 @@ TEST(StructuredLight, DoesNotDependOnThreadsOrOrder) {
   GrayCodeCapture turned = clean();
   for (FrameSet& set : turned.sets) std::reverse(set.frames.begin(), set.frames.end());
   std::reverse(turned.sets.begin(), turned.sets.end());
-  const auto parallel = scan_structured_light(rig(), turned, {}, {}, pool.work());
+  const auto parallel = scan_structured_light(rig(), turned, {}, rig().volume, {}, pool.work());
   ASSERT_TRUE(serial.ok() && parallel.ok());
   for (size_t i = 0; i < serial->scan.points.size(); ++i) {
     ASSERT_EQ(serial->scan.measured(i), parallel->scan.measured(i));
