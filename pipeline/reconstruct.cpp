@@ -10,6 +10,7 @@
 #include "pipeline/geometry/solid_parts.h"
 #include "pipeline/image/develop.h"
 #include "pipeline/surface/marching_cubes.h"
+#include "pipeline/surface/self_intersection.h"
 
 namespace booth {
 namespace {
@@ -269,6 +270,8 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
     }
     remove_small_handles(hull.field, options.handles, report.work());
     avatar.mesh = make_surface(hull.field, face ? &*face : nullptr, options, report.work(), &warnings);
+    if (const size_t left = remove_self_intersections(&avatar.mesh, report.work()); left > 0)
+      warnings.push_back("the surface passes through itself at " + std::to_string(left) + " edges");
     hull.field = {};
     if (work.stopped()) return Work::cancelled();
     if (avatar.mesh.triangles.empty()) return Error{ErrorCode::no_subject, "no surface is left after carving"};
