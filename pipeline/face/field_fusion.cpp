@@ -51,72 +51,62 @@ class ScanDepth {
   RayCaster rays_;
 };
 
-}  // namespace
-
-Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye,
-                const Work& work) {
-  if (scan.mesh.triangles.empty()) return field;
-  const ScanDepth depth(head, scan, eye);
+/// The field with other samples between an eye and what lies in a box: all that can lie before a surface there.
+/// @param box     of the surface
+/// @param sample  (point, value so far, metres) → its new value; may be called by several threads
+template <class Sample>
+Field rewrite(const Field& field, const Eigen::AlignedBox3f& box, const Eigen::Vector3f& eye, Sample&& sample,
+              const Work& work) {
   const Grid& grid = field.grid();
   const float cut_off = 2 * static_cast<float>(grid.voxel_m);
-  Eigen::AlignedBox3f box;
-  for (const auto& triangle : scan.mesh.triangles)
-    for (const uint32_t v : triangle)
-      if (scan.mesh.positions[v].y() > head.lowest_face_y()) box.extend(scan.mesh.positions[v]);
+  Eigen::AlignedBox3f reach = box;
+  constexpr float hull_excess_m = 0.08F;
+  const Eigen::Vector3f towards = (eye - box.center()).normalized() * hull_excess_m;
+  reach.extend(box.min() + towards);
+  reach.extend(box.max() + towards);
 
-  // New samples of the bricks between eye and scan, and what each brick is then.
+  // New samples of the bricks in reach, and what each brick is then.
   const auto [nx, ny, nz] = field.bricks();
-  std::vector<std::vector<float>> carved(static_cast<size_t>(nx) * static_cast<size_t>(ny) * static_cast<size_t>(nz));
+  std::vector<std::vector<float>> changed(static_cast<size_t>(nx) * static_cast<size_t>(ny) * static_cast<size_t>(nz));
   work.parallel_for(static_cast<size_t>(nz) * static_cast<size_t>(ny), 1, [&](size_t begin, size_t end) {
     for (size_t row = begin; row < end && !work.stopped(); ++row) {
       const int by = static_cast<int>(row) % ny, bz = static_cast<int>(row) / ny;
       for (int bx = 0; bx < nx; ++bx) {
         const size_t brick = field.brick_index(bx, by, bz);
-        if (field.brick(brick) == Field::all_outside) continue;
+        const int32_t block = field.brick(brick);
+        if (block == Field::all_outside) continue;
         const Eigen::Vector3f low = grid.point(bx * side, by * side, bz * side).cast<float>();
         const Eigen::Vector3f high = low + Eigen::Vector3f::Constant(static_cast<float>(side * grid.voxel_m));
-        // Only the front half of the head can lie before the scan: what the scan's box, reaching towards the eye,
-        // holds.
-        Eigen::AlignedBox3f reach = box;
-        constexpr float hull_excess_m = 0.08F;
-        const Eigen::Vector3f towards = (eye - box.center()).normalized() * hull_excess_m;
-        reach.extend(box.min() + towards);
-        reach.extend(box.max() + towards);
         if (!reach.intersects(Eigen::AlignedBox3f(low, high))) continue;
         std::vector<float> samples(Field::samples_per_brick);
-        bool changed = false;
+        bool any = false;
         size_t s = 0;
         for (int z = 0; z < side; ++z)
           for (int y = 0; y < side; ++y)
             for (int x = 0; x < side; ++x, ++s) {
               const int i = bx * side + x, j = by * side + y, k = bz * side + z;
               const bool beyond = i >= grid.size[0] || j >= grid.size[1] || k >= grid.size[2];
-              const int32_t block = field.brick(brick);
               const float before = block == Field::all_inside ? -cut_off : field.block(block)[s];
               samples[s] = before;
               if (beyond || before >= cut_off) continue;
-              const auto [distance, cosine, rim] = depth.at(grid.point(i, j, k).cast<float>());
-              constexpr float thickest_fill_m = 0.012F, fill_from_rim_m = 0.005F, steepest_fill = 0.4F;
-              const bool fills = distance < 0 && distance > -thickest_fill_m && rim > fill_from_rim_m &&
-                                 cosine > steepest_fill && before > distance;
-              if (distance <= before && !fills) continue;
-              samples[s] = std::min(distance, cut_off);
-              changed = true;
+              const float after = std::min(sample(grid.point(i, j, k).cast<float>(), before), cut_off);
+              any = any || after != before;
+              samples[s] = after;
             }
-        if (changed) carved[brick] = std::move(samples);
+        if (any) changed[brick] = std::move(samples);
       }
     }
   });
 
   Field out(grid);
   size_t blocks = 0;
-  for (size_t brick = 0; brick < carved.size(); ++brick)
-    if (!carved[brick].empty() || field.brick(brick) >= 0) ++blocks;
+  for (size_t brick = 0; brick < changed.size(); ++brick)
+    if (!changed[brick].empty() || field.brick(brick) >= 0) ++blocks;
   out.allocate_blocks(blocks);
   int32_t next = 0;
-  for (size_t brick = 0; brick < carved.size(); ++brick) {
-    if (!carved[brick].empty()) {
-      std::copy(carved[brick].begin(), carved[brick].end(), out.block(next));
+  for (size_t brick = 0; brick < changed.size(); ++brick) {
+    if (!changed[brick].empty()) {
+      std::copy(changed[brick].begin(), changed[brick].end(), out.block(next));
     } else if (field.brick(brick) >= 0) {
       std::copy_n(field.block(field.brick(brick)), Field::samples_per_brick, out.block(next));
     } else {
@@ -126,6 +116,70 @@ Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan
     out.set_brick(brick, next++);
   }
   return out;
+}
+
+/// 0 up to `from`, 1 beyond `to`, smooth between them.
+float smooth_step(float from, float to, float value) {
+  const float t = std::clamp((value - from) / (to - from), 0.0F, 1.0F);
+  constexpr float two = 2, three = 3;
+  return t * t * (three - two * t);
+}
+
+}  // namespace
+
+Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye,
+                const Work& work) {
+  if (scan.mesh.triangles.empty()) return field;
+  const ScanDepth depth(head, scan, eye);
+  Eigen::AlignedBox3f box;
+  for (const auto& triangle : scan.mesh.triangles)
+    for (const uint32_t v : triangle)
+      if (scan.mesh.positions[v].y() > head.lowest_face_y()) box.extend(scan.mesh.positions[v]);
+  return rewrite(
+      field, box, eye,
+      [&](const Eigen::Vector3f& p, float before) {
+        const auto [distance, cosine, rim] = depth.at(p);
+        constexpr float thickest_fill_m = 0.012F, fill_from_rim_m = 0.005F, steepest_fill = 0.4F;
+        const bool fills = distance < 0 && distance > -thickest_fill_m && rim > fill_from_rim_m &&
+                           cosine > steepest_fill && before > distance;
+        return distance > before || fills ? distance : before;
+      },
+      work);
+}
+
+Field blend_surface(const Field& field, const Mesh& surface, std::span<const float> weight, const Eigen::Vector3f& eye,
+                    const Work& work) {
+  if (surface.triangles.empty()) return field;
+  const RayCaster rays(surface);
+  Eigen::AlignedBox3f box;
+  for (const auto& triangle : surface.triangles)
+    for (const uint32_t v : triangle) box.extend(surface.positions[v]);
+  return rewrite(
+      field, box, eye,
+      [&](const Eigen::Vector3f& p, float before) {
+        const float far = (p - eye).norm();
+        const Eigen::Vector3f way = (p - eye) / far;
+        const auto hit = rays.cast(eye, way, 0, std::numeric_limits<float>::infinity());
+        if (!hit) return before;
+        const auto& [a, b, c] = surface.triangles[hit->triangle];
+        const Eigen::Vector3f &pa = surface.positions[a], &pb = surface.positions[b], &pc = surface.positions[c];
+        const Eigen::Vector3f normal = (pb - pa).cross(pc - pa);
+        const Eigen::Vector3f at = eye + hit->distance_m * way;
+        const float whole = normal.squaredNorm();
+        const float wb = (pc - pa).cross(pa - at).dot(normal) / whole,
+                    wc = (pa - at).cross(pb - pa).dot(normal) / whole;
+        const float share = (1 - wb - wc) * weight[a] + wb * weight[b] + wc * weight[c];
+        const float slant = -way.dot(normal) / std::sqrt(whole);
+        constexpr float least_cosine = 0.2F;
+        const float distance = (hit->distance_m - far) * std::max(least_cosine, slant);
+        // Behind the surface only a little is filled, and nothing where sight grazes it: other parts lie there.
+        constexpr float fill_m = 0.006F, no_fill_m = 0.012F, grazing = 0.2F, facing = 0.5F;
+        const float trust = distance >= 0
+                                ? smooth_step(0, least_cosine, slant)
+                                : smooth_step(-no_fill_m, -fill_m, distance) * smooth_step(grazing, facing, slant);
+        return before + share * trust * (distance - before);
+      },
+      work);
 }
 
 }  // namespace booth

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <span>
 
 #include "pipeline/face/head.h"
 #include "pipeline/face/scan_mesh.h"
@@ -24,5 +25,16 @@ namespace booth {
 /// data", CVIU 105(1), 2007.
 Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye,
                 const Work& work = {});
+
+/// Bends a hull's field to a surface that is known everywhere, such as a fitted face: where its weight is 1 the zero
+/// level is the surface, where it is 0 the hull, and between them it goes over smoothly, without a step or a rim.
+///
+/// @param field    as carve_visual_hull returns it
+/// @param surface  open, world frame, facing the eye; where the eye looks at it more than once, the first counts
+/// @param weight   per vertex of it, 0 … 1, falling to 0 at its rim
+/// @param eye      world frame, metres: what lies between it and the surface goes away; up to 12 mm behind the surface
+///                 is filled
+Field blend_surface(const Field& field, const Mesh& surface, std::span<const float> weight, const Eigen::Vector3f& eye,
+                    const Work& work = {});
 
 }  // namespace booth
