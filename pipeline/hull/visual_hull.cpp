@@ -8,9 +8,9 @@
 #include <string>
 
 #include "pipeline/geometry/silhouette_view.h"
+#include "pipeline/geometry/solid_parts.h"
 #include "pipeline/hull/camera_alignment.h"
 #include "pipeline/hull/contradictions.h"
-#include "pipeline/geometry/solid_parts.h"
 
 namespace booth {
 namespace {
@@ -270,6 +270,14 @@ SilhouetteViews make_views(const Rig& rig, std::span<const Silhouette> silhouett
   return views;
 }
 
+std::string describe(const CameraAgreement& agreement) {
+  std::ostringstream text;
+  text.precision(2);
+  text << "the picture of camera " << agreement.camera << " is off by " << agreement.offset_px
+       << " pixels from where the other cameras expect it; it was realigned, calibrate it anew";
+  return text.str();
+}
+
 }  // namespace
 
 Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette> silhouettes,
@@ -302,15 +310,16 @@ Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette>
   };
   carve();
   work.report(0.7);
-  const std::vector<Realignment> realignments = realign_cameras(*own_rig, views, hull.field, work);
-  for (const auto& [view, offset_px] : realignments) {
-    std::ostringstream text;
-    text.precision(2);
-    text << "the picture of camera " << views[view]->camera().id << " is off by " << offset_px
-         << " pixels from where the other cameras expect it; it was realigned, calibrate it anew";
-    hull.warnings.push_back(text.str());
+  const std::vector<CameraDeviation> deviations = realign_cameras(*own_rig, views, hull.field, work);
+  for (size_t v = 0; v < views.size(); ++v) {
+    hull.agreement.push_back({.camera = views[v]->camera().id,
+                              .moved = deviations[v].moved,
+                              .offset_px = deviations[v].offset_px,
+                              .deviation = deviations[v].deviation});
+    if (deviations[v].moved) hull.warnings.push_back(describe(hull.agreement.back()));
   }
-  if (!realignments.empty() && !work.stopped()) carve();
+  const bool any_moved = std::any_of(deviations.begin(), deviations.end(), [](const auto& d) { return d.moved; });
+  if (any_moved && !work.stopped()) carve();
   // Where a mask lacks a part, others may seem to lack something behind it: the worst is overruled first, and the
   // others are looked at anew.
   std::vector<bool> named(views.size());

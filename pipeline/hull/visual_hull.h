@@ -18,13 +18,22 @@ struct VisualHullOptions {
   int min_views = 3;       ///< a point inside fewer cameras' images is outside the hull, 1 … the number of cameras
 };
 
+/// Whether a camera's silhouette agrees with the others'; see camera_alignment.h.
+struct CameraAgreement {
+  std::string camera;
+  bool moved = false;    ///< it no longer stands where it was calibrated
+  double offset_px = 0;  ///< by how much its picture of the subject is off
+  double deviation = 0;  ///< in standard deviations; 0 where nobody can tell
+};
+
 struct VisualHull {
   Field field;  ///< metres where stored, cut off at two voxels; negative inside, positive on the grid's border
-  /// The rig given, with the principal points of cameras moved that do not agree with the others.
+  /// The rig given, with cameras put back that were moved since their calibration.
   std::shared_ptr<const Rig> rig;
   SilhouetteViews views;  ///< the silhouettes that it explains: overruled where a camera was; of cameras in `rig`
-  std::vector<std::string> cameras;   ///< ids of the cameras that were used
-  std::vector<std::string> warnings;  ///< sentences for an operator
+  std::vector<std::string> cameras;        ///< ids of the cameras that were used
+  std::vector<CameraAgreement> agreement;  ///< of each of these
+  std::vector<std::string> warnings;       ///< sentences for an operator
 };
 
 /// The largest solid that fits inside every silhouette and inside rig.volume: one connected body without cavities.

@@ -7,6 +7,7 @@
 #include <cmath>
 #include <cstring>
 
+#include "pipeline/geometry/camera_model.h"
 #include "pipeline/hull/visual_hull.h"
 #include "pipeline/thread_pool.h"
 #include "tests/synthetic/body.h"
@@ -29,7 +30,7 @@ struct Capture {
 /// A person in a ring of nine cameras whose calibration is exact.
 const Capture& exact_capture() {
   static const Capture capture = [] {
-    Capture made{synthetic::ring_rig({.cameras = 9, .width = 150, .height = 200}), {}};
+    Capture made{synthetic::ring_rig({.cameras = 9, .width = 300, .height = 400}), {}};
     made.silhouettes = synthetic::render_silhouettes(synthetic::person().body, made.rig);
     return made;
   }();
@@ -43,19 +44,47 @@ Capture with_moved_camera(size_t camera, const Eigen::Vector2d& by_px) {
   return capture;
 }
 
+/// Where a camera sees a point beside the subject's middle.
+Eigen::Vector2d seen_point(const CalibratedView& camera) {
+  return project(camera, Eigen::Vector3d(0.1, 1.2, 0)).value();
+}
+
 TEST(CameraAlignment, MeasuresHowFarACameraIsOff) {
   const Eigen::Vector2d off_px(2.0, -1.5);
   constexpr size_t moved = 4;
-  const Capture capture = with_moved_camera(moved, off_px);
+  Capture capture = with_moved_camera(moved, off_px);
   SilhouetteViews views;
   for (size_t i = 0; i < capture.silhouettes.size(); ++i)
     views.push_back(std::make_unique<SilhouetteView>(capture.rig.cameras[i], capture.silhouettes[i].coverage));
   const auto hull = carve_visual_hull(capture.rig, capture.silhouettes, coarse);
   ASSERT_TRUE(hull.ok());
-  const auto offsets = measure_camera_offsets(views, hull->field);
-  ASSERT_EQ(offsets.size(), views.size());
-  EXPECT_LT((offsets[moved].shift_px + off_px).norm(), 1.0) << offsets[moved].shift_px.transpose();
-  EXPECT_GT(offsets[moved].support, 50U);
+  const auto deviations = realign_cameras(capture.rig, views, hull->field);
+  ASSERT_EQ(deviations.size(), views.size());
+  for (size_t v = 0; v < views.size(); ++v) EXPECT_EQ(deviations[v].moved, v == moved) << v;
+  EXPECT_LT((seen_point(capture.rig.cameras[moved]) - seen_point(exact_capture().rig.cameras[moved])).norm(), 1.0);
+  EXPECT_GT(deviations[moved].offset_px, 0.8);
+}
+
+TEST(CameraAlignment, ACameraThatWasTurnedOrCarriedIsPutBack) {
+  constexpr double turn_rad = 0.01, carry_m = 0.03;  // three pixels and more of these small pictures
+  for (int axis = 0; axis < 5; ++axis) {
+    Capture capture = exact_capture();
+    constexpr size_t moved = 3;
+    Eigen::Isometry3d motion = Eigen::Isometry3d::Identity();
+    if (axis < 3)
+      motion.linear() = Eigen::AngleAxisd(turn_rad, Eigen::Vector3d::Unit(axis)).toRotationMatrix();
+    else
+      motion.translation() = carry_m * Eigen::Vector3d::Unit(axis - 3);
+    Eigen::Isometry3d& pose = capture.rig.cameras[moved].camera_from_world;
+    pose = motion * pose;
+    const auto hull = carve_visual_hull(capture.rig, capture.silhouettes, coarse);
+    ASSERT_TRUE(hull.ok());
+    for (size_t i = 0; i < hull->agreement.size(); ++i)
+      EXPECT_EQ(hull->agreement[i].moved, i == moved) << axis << " " << i << ": " << hull->agreement[i].deviation;
+    const double off_px =
+        (seen_point(hull->rig->cameras[moved]) - seen_point(exact_capture().rig.cameras[moved])).norm();
+    EXPECT_LT(off_px, 1.2) << axis;
+  }
 }
 
 TEST(CameraAlignment, AnyMovedCameraIsRealignedAndNamed) {
@@ -67,9 +96,8 @@ TEST(CameraAlignment, AnyMovedCameraIsRealignedAndNamed) {
     ASSERT_TRUE(hull.ok());
     EXPECT_THAT(hull->warnings, ElementsAre(HasSubstr(capture.rig.cameras[camera].id)));
     for (size_t other = 0; other < capture.rig.cameras.size(); ++other) {
-      const Intrinsics& found = hull->rig->cameras[other].intrinsics;
-      const Intrinsics& truth = exact_capture().rig.cameras[other].intrinsics;
-      EXPECT_LT(std::hypot(found.cx - truth.cx, found.cy - truth.cy), 1.2) << camera << " " << other;
+      const Eigen::Vector2d found = seen_point(hull->rig->cameras[other]);
+      EXPECT_LT((found - seen_point(exact_capture().rig.cameras[other])).norm(), 1.2) << camera << " " << other;
     }
   }
 }
@@ -82,7 +110,7 @@ TEST(CameraAlignment, WellCalibratedCamerasStayWhereTheyAre) {
     ASSERT_TRUE(hull.ok());
     EXPECT_THAT(hull->warnings, IsEmpty()) << cameras;
     for (size_t i = 0; i < capture.rig.cameras.size(); ++i)
-      EXPECT_EQ(hull->rig->cameras[i].intrinsics.cx, capture.rig.cameras[i].intrinsics.cx);
+      EXPECT_TRUE(hull->rig->cameras[i].camera_from_world.isApprox(capture.rig.cameras[i].camera_from_world, 0));
   }
 }
 
