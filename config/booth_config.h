@@ -56,6 +56,11 @@ struct JobsConfig {
   int retries = 1;      ///< of a reconstruction whose process died, 0 … 10
 };
 
+struct FaceConfig {
+  /// Of the passive face: 68 landmarks, in dlib's format.
+  std::filesystem::path landmark_model = "/usr/share/dlib/shape_predictor_68_face_landmarks.dat";
+};
+
 enum class LogLevel { error, warning, info, debug };
 
 struct LogConfig {
@@ -114,6 +119,7 @@ struct BoothConfig {
   TriggerConfig trigger;
   ProjectorConfig projector;
   ReplayOptions replay;
+  FaceConfig face;
   ReconstructionOptions reconstruct;
   AvatarFileOptions files;  ///< section [export]
 };

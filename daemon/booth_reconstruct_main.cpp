@@ -16,6 +16,7 @@
 #include <thread>
 
 #include "config/booth_config.h"
+#include "daemon/face_model_loader.h"
 #include "daemon/reconstruct_job.h"
 #include "pipeline/thread_pool.h"
 
@@ -126,11 +127,13 @@ int run(const Arguments& arguments) {
   work.stop = stop.token();
   ProgressBar bar;
   const bool draw = isatty(STDERR_FILENO) != 0 && arguments.progress_fd < 0;
-  const auto made = reconstruct_recording(arguments.recording, arguments.avatar, options, config.files, work,
-                                          [&](std::string_view stage, double fraction) {
-                                            if (draw) bar.draw(stage, fraction);
-                                            pipe.tell({{"stage", stage}, {"fraction", fraction}});
-                                          });
+  FaceModelLoader face_model(config.face.landmark_model);
+  const auto made = reconstruct_recording(
+      arguments.recording, arguments.avatar, options, [&] { return face_model.get(); }, config.files, work,
+      [&](std::string_view stage, double fraction) {
+        if (draw) bar.draw(stage, fraction);
+        pipe.tell({{"stage", stage}, {"fraction", fraction}});
+      });
   bar.clear();
   if (!made) return fail(pipe, made.error(), exit_failed);
   for (const std::string& warning : made->warnings) std::cerr << "warning: " << warning << "\n";

@@ -133,7 +133,8 @@ const std::vector<std::string>& job_stages() {
 
 Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_folder,
                                         const std::filesystem::path& avatar, const ReconstructionOptions& options,
-                                        const AvatarFileOptions& files, const Work& work, const JobProgress& progress) {
+                                        const FaceModelSource& face_model, const AvatarFileOptions& files,
+                                        const Work& work, const JobProgress& progress) {
   // A trailing slash names the same folder.
   const std::filesystem::path target = avatar.has_filename() ? avatar : avatar.parent_path();
   const std::filesystem::path parent = target.has_parent_path() ? target.parent_path() : ".";
@@ -152,7 +153,7 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   if (!capture) return capture.error();
 
   const auto stage_progress = [&](std::string_view stage, double fraction) { clock.tell(stage, fraction); };
-  auto made = reconstruct(*capture, options, work, stage_progress);
+  auto made = reconstruct(*capture, options, face_model, work, stage_progress);
   if (!made) return made.error();
   append(&report.warnings, made->warnings);
   *capture = {};  // the export needs the memory more than anybody needs the images
@@ -163,6 +164,7 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   metadata.label = recording->label;
   metadata.recording = recording->id;
   metadata.cameras = std::move(made->cameras);
+  metadata.face = to_string(made->face);
   metadata.warnings = report.warnings;
   metadata.stage_seconds = clock.finish();
   clock.tell("export", 0);

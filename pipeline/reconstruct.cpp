@@ -6,6 +6,7 @@
 #include <span>
 #include <utility>
 
+#include "pipeline/face/face_patch.h"
 #include "pipeline/face/field_fusion.h"
 #include "pipeline/geometry/solid_parts.h"
 #include "pipeline/image/develop.h"
@@ -123,11 +124,13 @@ Result<SegmentedViews> segment_all(const CaptureFrames& capture, std::span<const
   return views;
 }
 
-/// The face's scan, cleaned and joined to a mesh.
+/// The face's own surface as a mesh.
 struct FaceSurface {
-  HeadRegion head;  ///< of the hull
+  FaceMode made = FaceMode::none;  ///< active: scanned; passive: fitted
+  HeadRegion head;                 ///< of the hull
   ScanMesh scan;
-  Eigen::Vector3f eye;  ///< where it was seen from, world frame
+  Eigen::Vector3f eye;             ///< where it was seen from, world frame
+  std::optional<FacePatch> patch;  ///< of a fitted one, which goes over into the hull
 };
 
 Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Silhouette> silhouettes, const Field& hull,
@@ -141,12 +144,58 @@ Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Silh
   warnings->insert(warnings->end(), scanned->warnings.begin(), scanned->warnings.end());
   auto meshed = mesh_scan(scanned->scan, {}, work);
   if (!meshed) return meshed.error();
-  return FaceSurface{*head, std::move(*meshed), scanned->eye};
+  return FaceSurface{FaceMode::active, *head, std::move(*meshed), scanned->eye, {}};
+}
+
+/// The face by landmarks and a neutral head.
+Result<FaceSurface> fit_face(const VisualHull& hull, std::span<const Frame> frames,
+                             const ReconstructionOptions& options, const FaceModelSource& face_model,
+                             const Work& work) {
+  if (!face_model) return Error{ErrorCode::not_found, "there is no model of landmarks"};
+  const auto model = face_model();
+  if (!model) return model.error();
+  const auto head = find_head(extract_surface(hull.field, work));
+  if (!head) return Error{ErrorCode::no_subject, "no head was found"};
+  const auto controls = find_control_points(*hull.rig, frames, *head, *model->landmarks, options.control_points, work);
+  if (!controls) return controls.error();
+  const auto fitted = fit_neutral_head(*model->neutral, *controls, hull.views, hull.field, options.head_fit, work);
+  if (!fitted) return fitted.error();
+  FacePatch patch = face_patch(*fitted);
+  if (patch.core.mesh.triangles.empty())
+    return Error{ErrorCode::no_subject, "hair or something else covers most of the face"};
+  const Eigen::Vector3f eye = patch.eye;
+  ScanMesh core = std::move(patch.core);
+  return FaceSurface{FaceMode::passive, *head, std::move(core), eye, std::move(patch)};
+}
+
+/// The face as asked for, or nothing and in the warnings why.
+std::optional<FaceSurface> make_face(const CaptureFrames& capture, const VisualHull& hull,
+                                     std::span<const Frame> frames, std::span<const Silhouette> silhouettes,
+                                     const ReconstructionOptions& options, const FaceModelSource& face_model,
+                                     const Work& work, std::vector<std::string>* warnings) {
+  if (options.face == FaceMode::none) return std::nullopt;
+  if (wants_scan(options.face) && capture.face) {
+    auto scanned = scan_face(capture, silhouettes, hull.field, options, work, warnings);
+    if (scanned) return std::move(*scanned);
+    const bool fits = options.face == FaceMode::automatic && face_model;
+    warnings->push_back((fits ? "the face was not scanned: " : "the face is the hull's own: ") +
+                        scanned.error().message);
+    if (!fits) return std::nullopt;
+  } else if (options.face == FaceMode::active) {
+    warnings->emplace_back("the face is the hull's own: the recording has no structured-light shot");
+    return std::nullopt;
+  } else if (options.face == FaceMode::automatic && !face_model) {
+    return std::nullopt;
+  }
+  auto fitted = fit_face(hull, frames, options, face_model, work);
+  if (fitted) return std::move(*fitted);
+  warnings->push_back("the face is the hull's own: " + fitted.error().message);
+  return std::nullopt;
 }
 
 /// The closed surface within its budget of triangles, with the face's scan where there is one that meets it.
 Mesh make_surface(const Field& field, const FaceSurface* face, const ReconstructionOptions& options, const Work& work,
-                  std::vector<std::string>* warnings) {
+                  std::vector<std::string>* warnings, FaceMode* made) {
   const Mesh mesh = smooth_hc(extract_surface(field, work), options.smoothing, work);
   if (face == nullptr) return decimate(mesh, options.decimation, work);
   auto merged = merge_face(mesh, face->head, face->scan, face->eye, options.face_merge, work);
@@ -154,6 +203,7 @@ Mesh make_surface(const Field& field, const FaceSurface* face, const Reconstruct
     warnings->push_back("the face is the hull's own: " + merged.error().message);
     return decimate(mesh, options.decimation, work);
   }
+  *made = face->made;
   return decimate(merged->mesh, merged->face, options.face_share, options.decimation, work);
 }
 
@@ -204,12 +254,12 @@ const std::vector<std::string>& reconstruction_stages() {
   return stages;
 }
 
-Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options, const Work& work,
-                                   const StageProgress& progress) {
+Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options,
+                                   const FaceModelSource& face_model, const Work& work, const StageProgress& progress) {
   if (is_raw(capture.body) || std::any_of(capture.background.begin(), capture.background.end(), is_raw) ||
       (capture.face && std::any_of(capture.face->sets.begin(), capture.face->sets.end(), is_raw))) {
     const auto developed = develop_all(capture, work);
-    return developed ? reconstruct(*developed, options, work, progress) : developed.error();
+    return developed ? reconstruct(*developed, options, face_model, work, progress) : developed.error();
   }
   if (const auto checked = check(capture.rig); !checked) return checked.error();
   Reconstruction result;
@@ -240,36 +290,27 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
   {
     const StageReport report("refine", work, progress);
     hull.field = refine_shape(std::move(hull.field), hull.views, options.refinement, report.work());
-    hull.views.clear();
     if (work.stopped()) return Work::cancelled();
   }
 
   std::optional<FaceSurface> face;
   {
     const StageReport report("face", work, progress);
-    if (wants_scan(options.face) && capture.face) {
-      auto scanned = scan_face(capture, views.silhouettes, hull.field, options, report.work(), &warnings);
-      if (work.stopped()) return Work::cancelled();
-      if (scanned)
-        face = std::move(*scanned);
-      else
-        warnings.push_back("the face is the hull's own: " + scanned.error().message);
-    } else if (options.face == FaceMode::active) {
-      warnings.emplace_back("the face is the hull's own: the recording has no structured-light shot");
-    } else if (options.face == FaceMode::passive) {
-      warnings.emplace_back("the face is the hull's own: refinement (passive) is not available in this version");
-    }
+    face = make_face(capture, hull, frames, views.silhouettes, options, face_model, report.work(), &warnings);
+    hull.views.clear();
+    if (work.stopped()) return Work::cancelled();
   }
 
   Avatar& avatar = result.avatar;
   {
     const StageReport report("surface", work, progress);
-    if (face && options.face_merge.method == FaceMergeMethod::sight) {
+    if (face && face->made == FaceMode::passive)
+      hull.field = blend_surface(hull.field, face->patch->mesh, face->patch->weight, face->eye, report.work());
+    else if (face && options.face_merge.method == FaceMergeMethod::sight)
       hull.field = fuse_scan(hull.field, face->head, face->scan, face->eye, report.work());
-      keep_largest_part(hull.field, report.work());
-    }
+    if (face) keep_largest_part(hull.field, report.work());
     remove_small_handles(hull.field, options.handles, report.work());
-    avatar.mesh = make_surface(hull.field, face ? &*face : nullptr, options, report.work(), &warnings);
+    avatar.mesh = make_surface(hull.field, face ? &*face : nullptr, options, report.work(), &warnings, &result.face);
     if (const size_t left = remove_self_intersections(&avatar.mesh, report.work()); left > 0)
       warnings.push_back("the surface passes through itself at " + std::to_string(left) + " edges");
     hull.field = {};

@@ -1,13 +1,18 @@
 #pragma once
 
 #include <functional>
+#include <memory>
 #include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
 
 #include "pipeline/atlas/texture_atlas.h"
+#include "pipeline/face/control_points.h"
 #include "pipeline/face/face_merge.h"
+#include "pipeline/face/head_fit.h"
+#include "pipeline/face/landmark_predictor.h"
+#include "pipeline/face/neutral_head.h"
 #include "pipeline/hull/visual_hull.h"
 #include "pipeline/refine/handle_removal.h"
 #include "pipeline/refine/shape_refinement.h"
@@ -24,7 +29,7 @@
 
 namespace booth {
 
-/// How the face is made. Automatic: active where there is a projector, else passive.
+/// How the face is made. Automatic: active where a scan was taken and is usable, else passive.
 enum class FaceMode { automatic, active, passive, none };
 
 std::string_view to_string(FaceMode mode);
@@ -44,6 +49,8 @@ struct ReconstructionOptions {
   DecimationOptions decimation;
   StructuredLightOptions structured_light;
   FaceMergeOptions face_merge;
+  ControlPointOptions control_points;
+  HeadFitOptions head_fit;
   double face_share = 0.35;  ///< of decimation.triangles, for a face that was scanned, 0 … 0.9
   AtlasOptions atlas;
   SkeletonOptions skeleton;
@@ -58,8 +65,19 @@ struct CaptureFrames {
   std::optional<GrayCodeCapture> face = {};  ///< the face under structured light, where it was taken
 };
 
+/// What the passive face needs besides a capture. It takes a second to load and serves any number of reconstructions.
+struct FaceModel {
+  std::shared_ptr<const LandmarkPredictor> landmarks;  ///< never null
+  std::shared_ptr<const NeutralHead> neutral;          ///< never null
+};
+
+/// Gives the model, and may wait for it. Asked at most once a reconstruction, and only when there is a passive face to
+/// make.
+using FaceModelSource = std::function<Result<FaceModel>()>;
+
 struct Reconstruction {
   Avatar avatar;
+  FaceMode face = FaceMode::none;     ///< how it was made: active, passive, or none: the hull's own
   std::vector<std::string> cameras;   ///< ids of those that shaped it
   std::vector<std::string> warnings;  ///< sentences for an operator
 };
@@ -72,12 +90,15 @@ using StageProgress = std::function<void(std::string_view stage, double fraction
 
 /// The whole method: segment → hull → refine → face → surface → atlas → skeleton → skin.
 ///
-/// @param work  its progress is not used; stages report through `progress`
+/// @param face_model  for the passive face; left out, there is none
+/// @param work        its progress is not used; stages report through `progress`
 /// A camera that cannot be used is left out with a warning; a shape that cannot be rigged comes back without joints
-/// and with a warning; a face scan that is missing or too poor leaves the hull's face, with a warning.
+/// and with a warning; a face that cannot be had as asked for, or would be worse than the hull's, is the hull's, with a
+/// warning.
 ///
 /// @error what the stages return, cancelled
 Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options,
-                                   const Work& work = {}, const StageProgress& progress = {});
+                                   const FaceModelSource& face_model = {}, const Work& work = {},
+                                   const StageProgress& progress = {});
 
 }  // namespace booth

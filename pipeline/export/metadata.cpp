@@ -84,6 +84,7 @@ std::string write_metadata(const AvatarMetadata& metadata) {
                        {"label", metadata.label},
                        {"recording", metadata.recording},
                        {"software_version", metadata.software_version},
+                       {"face", metadata.face},
                        {"cameras", metadata.cameras},
                        {"triangles", metadata.triangles},
                        {"joints", metadata.joints},
@@ -105,6 +106,7 @@ Result<AvatarMetadata> read_metadata(std::string_view json) {
   reader.read_optional("label", metadata.label);
   reader.read("recording", metadata.recording);
   reader.read("software_version", metadata.software_version);
+  reader.read_optional("face", metadata.face);
   reader.read_optional("cameras", metadata.cameras);
   reader.read("triangles", metadata.triangles);
   reader.read("joints", metadata.joints);

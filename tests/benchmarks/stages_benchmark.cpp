@@ -112,7 +112,7 @@ void whole_job(Inputs& in) {
   const std::filesystem::path folder = std::filesystem::temp_directory_path() / "booth-benchmark";
   std::filesystem::remove_all(folder);
   benchmark::DoNotOptimize(
-      must(reconstruct_recording(in.recording.folder, folder / "avatar", in.options, {}, in.work)));
+      must(reconstruct_recording(in.recording.folder, folder / "avatar", in.options, {}, {}, in.work)));
   std::filesystem::remove_all(folder);
 }
 

@@ -42,7 +42,7 @@ class ReconstructJob : public testing::Test {
     Work work = pool_.work();
     work.stop = extra.stop;
     return reconstruct_recording(
-        folder_ / "recording", folder_ / "out/avatar", options, {}, work,
+        folder_ / "recording", folder_ / "out/avatar", options, {}, {}, work,
         [this](std::string_view stage, double fraction) { news_.emplace_back(stage, fraction); });
   }
   bool nothing_is_left() const { return !fs::exists(folder_ / "out") || fs::is_empty(folder_ / "out"); }
