@@ -298,7 +298,7 @@ TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
       testing::UnorderedElementsAre(
           "colour: \"red\", expected one of the keys booth, api, capture, disk, jobs, log, cameras, trigger, "
           "projector, replay, "
-          "reconstruct, export",
+          "face, reconstruct, export",
           "log: 3, expected a table: [log]", "booth.name: \"\", expected a text of 1 … 64 bytes on one line",
           "capture.frame_timeout_ms: 0, expected 50 … 60000",
           "capture.min_cameras: \"many\", expected a whole number, 1 … 256",
