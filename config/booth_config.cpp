@@ -165,6 +165,8 @@ void visit_v4l2(Visitor& visitor, V4l2CameraSettings& camera) {
   visitor.assignments("controls", controls, [](const std::string& value) { return whole_number(value).has_value(); });
   camera.controls.clear();
   for (const auto& [name, value] : controls) camera.controls[name] = *whole_number(value);
+  visitor.choice("trigger", camera.trigger,
+                 Words<V4l2TriggerSource>{{"stream", V4l2TriggerSource::stream}, {"line", V4l2TriggerSource::line}});
   visitor.integer("buffers", camera.buffers, 2, 32);
   visitor.integer("warm_up_frames", camera.warm_up_frames, 0, 100);
   visitor.integer("latency_us", camera.latency_us, 0, 1'000'000);
@@ -771,6 +773,26 @@ void note(const Result<void>& checked, const char* path, std::vector<ConfigFault
   if (!checked) faults.push_back({path, checked.error().message, ""});
 }
 
+/// A camera that does not listen to what fires would be missing from every shot.
+void check_triggers(const BoothConfig& config, const std::vector<AravisCameraSettings>& cameras,
+                    std::vector<ConfigFault>& faults) {
+  const auto count = [&](AravisTriggerSource trigger) {
+    return std::count_if(cameras.begin(), cameras.end(), [&](const auto& camera) { return camera.trigger == trigger; });
+  };
+  const auto lines = count(AravisTriggerSource::line), actions = count(AravisTriggerSource::action);
+  const auto all = static_cast<std::ptrdiff_t>(cameras.size());
+  const bool orders = config.trigger.driver == TriggerDriver::aravis;
+  if (orders && lines == all)
+    faults.push_back({"trigger.driver", "\"aravis\"", "another one: no camera has the trigger software or action"});
+  else if (orders && lines > 0)
+    faults.push_back({"trigger.driver", "\"aravis\"", "the trigger software or action of every camera, not \"line\""});
+  else if (orders && actions > 0 && actions < all)
+    faults.push_back({"trigger.driver", "\"aravis\"", "one trigger for all cameras, either software or action"});
+  else if (!orders && lines < all)
+    faults.push_back({"trigger.driver", "another than \"aravis\"",
+                      "the trigger \"line\" of every camera: software and action are for \"aravis\""});
+}
+
 void check_cameras(const BoothConfig& config, std::vector<ConfigFault>& faults) {
   std::set<std::string> ids;
   bool replayed = config.cameras.empty();
@@ -790,10 +812,7 @@ void check_cameras(const BoothConfig& config, std::vector<ConfigFault>& faults) 
   if (config.trigger.driver == TriggerDriver::gpio) note(check(config.trigger.gpio), "trigger.gpio", faults);
   if (config.trigger.driver == TriggerDriver::replay && !replayed)
     faults.push_back({"trigger.driver", "\"replay\"", "another one: no camera is replayed"});
-  const bool listens = std::any_of(aravis.cameras.begin(), aravis.cameras.end(),
-                                   [](const auto& camera) { return camera.trigger != AravisTriggerSource::line; });
-  if (config.trigger.driver == TriggerDriver::aravis && !listens)
-    faults.push_back({"trigger.driver", "\"aravis\"", "another one: no camera has the trigger software or action"});
+  check_triggers(config, aravis.cameras, faults);
   if (config.projector.driver == ProjectorDriver::replay && !replayed)
     faults.push_back({"projector.driver", "\"replay\"", "another one, or \"none\": no camera is replayed"});
   if (config.projector.driver == ProjectorDriver::gpio) note(check(config.projector.gpio), "projector.gpio", faults);

@@ -111,6 +111,7 @@ Booth::~Booth() {
   session_.reset();
   cameras_.reset();
   previews_.reset();
+  if (warnings_) warnings_->listen({});
   if (state_lock_ >= 0) ::close(state_lock_);
 }
 
@@ -157,6 +158,13 @@ void Booth::open_capture(const Devices& devices) {
   }
 
   drivers_ = devices.drivers;
+  warnings_ = devices.warnings;
+  if (warnings_)
+    warnings_->listen([this](const std::string& sentence) {
+      spdlog::warn("{}", sentence);
+      metrics_.add("driver_warnings");
+      events_.publish(Alert{Severity::warning, "camera_unavailable", sentence});
+    });
   mount_rotations_ = devices.mount_rotations;
   std::vector<CameraInfo> cameras = devices.cameras;
   const auto rig = this->rig();

@@ -25,6 +25,7 @@
 #include "daemon/preview_board.h"
 #include "daemon/serial_executor.h"
 #include "daemon/task_board.h"
+#include "daemon/warning_relay.h"
 #include "drivers/clock.h"
 #include "drivers/device_source.h"
 #include "replay/recording.h"
@@ -48,6 +49,7 @@ struct Devices {
   std::optional<Rig> rig;                      ///< nothing: the booth is not calibrated
   std::string rig_fault;                       ///< why there is none, where one was there but cannot be used
   std::string rig_created;                     ///< ISO 8601, UTC; may be empty
+  std::shared_ptr<WarningRelay> warnings;      ///< of the drivers; may be null
   std::optional<Recording> replayed;           ///< whose background is the booth's, where the devices are played back
 };
 
@@ -186,6 +188,7 @@ class Booth {
   std::map<std::string, int> mount_rotations_;
   std::string device_fault_;  ///< why there are no devices; empty when there are
   std::vector<Driver> drivers_;
+  std::shared_ptr<WarningRelay> warnings_;
   std::unique_ptr<PreviewBoard> previews_;  ///< the cameras' threads use it
   std::unique_ptr<CameraSupervisor> cameras_;
   std::unique_ptr<CaptureSession> session_;

@@ -171,6 +171,7 @@ void Operator::status() {
               << text_of(camera, "dropped") << " dropped";
     if (!camera.at("message").is_null()) std::cout << ": " << text_of(camera, "message");
     std::cout << "\n";
+    for (const Json& warning : camera.at("warnings")) std::cout << "            " << warning.get<std::string>() << "\n";
   }
   for (const char* device : {"projector", "trigger"}) {
     const Json& found = status.at(device);

@@ -213,8 +213,10 @@ Result<void> SupervisedCamera::take_test_frame(const std::stop_token& stop) {
 void SupervisedCamera::read_statistics() {
   if (device_ == nullptr) return;
   std::vector<Statistic> statistics = device_->statistics();
+  std::vector<std::string> warnings = device_->warnings();
   const std::lock_guard lock(mutex_);
   status_.statistics = std::move(statistics);
+  status_.warnings = std::move(warnings);
 }
 
 void SupervisedCamera::lose(const Error& error) {
@@ -222,6 +224,7 @@ void SupervisedCamera::lose(const Error& error) {
   {
     const std::lock_guard lock(mutex_);
     lost = std::move(device_);
+    status_.warnings.clear();
   }
   lost.reset();  // may take its time, so not under the lock
   set_state(DeviceState::offline, error.message, is_permanent(error.code));

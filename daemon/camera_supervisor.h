@@ -27,6 +27,7 @@ struct CameraStatus {
   uint64_t frames = 0, dropped = 0;  ///< of triggers
   std::optional<double> last_frame_age_s = {};
   std::vector<Statistic> statistics = {};  ///< of its transport, a second old at most while nothing happens
+  std::vector<std::string> warnings = {};  ///< sentences: what an operator should know though it works
 };
 
 /// What an armed camera has to say: that it is armed, a frame, or what went wrong.

@@ -1,4 +1,3 @@
-#include <spdlog/spdlog.h>
 #include <sys/stat.h>
 
 #include <algorithm>
@@ -40,7 +39,8 @@ bool needs_recording(const BoothConfig& config) {
          });
 }
 
-Result<Drivers> open_drivers(const BoothConfig& config, const Clock& clock) {
+Result<Drivers> open_drivers(const BoothConfig& config, const std::shared_ptr<WarningRelay>& warnings,
+                             const Clock& clock) {
   Drivers drivers;
   if (needs_recording(config)) {
     auto replay = ReplaySource::open(config.replay, clock);
@@ -49,7 +49,7 @@ Result<Drivers> open_drivers(const BoothConfig& config, const Clock& clock) {
   }
   const auto [aravis_settings, v4l2_settings] = live_cameras(config);
   auto aravis = AravisSource::create(aravis_settings, clock,
-                                     [](const std::string& sentence) { spdlog::warn("aravis: {}", sentence); });
+                                     [warnings](const std::string& sentence) { warnings->warn(sentence); });
   if (!aravis) return aravis.error();
   drivers.aravis = *std::move(aravis);
   auto v4l2 = V4l2Source::open(v4l2_settings, clock);
@@ -144,9 +144,10 @@ void find_rig(const BoothConfig& config, const Drivers& drivers, Devices& device
 }  // namespace
 
 Result<Devices> open_devices(const BoothConfig& config, const Clock& clock) {
-  const auto drivers = open_drivers(config, clock);
-  if (!drivers) return drivers.error();
   Devices devices;
+  devices.warnings = std::make_shared<WarningRelay>();
+  const auto drivers = open_drivers(config, devices.warnings, clock);
+  if (!drivers) return drivers.error();
   CombinedParts parts;
   bool replayed = false;
   for (const CameraConfig& camera : cameras_of(config, *drivers)) {

@@ -95,8 +95,8 @@ size_t FrameCollector::reachable() const {
 
 CollectedShot FrameCollector::collect(Timestamp when, Timestamp deadline, const std::stop_token& stop) {
   fired_.push_back(when);
-  for (const std::string& id : ids_)
-    if (!gone_.contains(id)) cameras_.camera(id).note_trigger(static_cast<int>(latest()), when);
+  // Of those that are given up too: one that was armed late would take this trigger's frame for the next one's.
+  for (const std::string& id : ids_) cameras_.camera(id).note_trigger(static_cast<int>(latest()), when);
   damaged_.clear();
   remarks_.clear();
   frames_.erase(frames_.begin(), frames_.lower_bound(latest()));

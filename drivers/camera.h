@@ -68,6 +68,9 @@ class Camera {
   /// What the transport counts; empty where there is nothing to count.
   virtual std::vector<Statistic> statistics() const { return {}; }
 
+  /// What an operator should know now though it works: "socket_buffer_kib: 16384, but the kernel allows 208: …".
+  virtual std::vector<std::string> warnings() const { return {}; }
+
   /// Back to idle; a waiting wait_frame returns cancelled.
   virtual void stop() noexcept = 0;
 };

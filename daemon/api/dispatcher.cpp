@@ -48,6 +48,7 @@ Json to_json(const CameraStatus& camera) {
           {"frames", camera.frames},
           {"dropped", camera.dropped},
           {"message", text_or_null(camera.message)},
+          {"warnings", camera.warnings},
           {"fault", fault_of(camera.state, camera.permanent)}};
 }
 

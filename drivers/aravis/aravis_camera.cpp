@@ -20,6 +20,9 @@ constexpr size_t spare_buffers = 2;  ///< beyond the frames of a shot
 constexpr size_t preview_buffers = 4;
 constexpr size_t most_automatic_buffers = 128;
 
+/// What every Ethernet carries is 1500 bytes; some tunnels take a little of it.
+constexpr gint usual_packet_size = 1400;
+
 /// A camera that owes a frame this long is asked whether it is still there.
 constexpr Timestamp worrying_silence = milliseconds(700);
 constexpr std::chrono::milliseconds answer_patience{900};
@@ -67,23 +70,24 @@ class ScopedFlag {
 
 }  // namespace
 
-AravisCamera::AravisCamera(const AravisCameraSettings& settings, const AravisActionSettings& action, const Clock& clock,
-                           Warn warn)
+AravisCamera::AravisCamera(const AravisCameraSettings& settings, const AravisActionSettings& action,
+                           std::shared_ptr<PtpWatch> ptp, const Clock& clock, Warn warn)
     : settings_(settings),
       action_(action),
+      ptp_(std::move(ptp)),
       clock_(clock),
       warn_(std::move(warn)),
       events_(std::make_shared<Events>(clock)) {}
 
 Result<std::shared_ptr<AravisCamera>> AravisCamera::open(GObjectPtr<ArvDevice> device, std::optional<in_addr> address,
                                                          const AravisCameraSettings& settings,
-                                                         const AravisActionSettings& action, const Clock& clock,
-                                                         Warn warn) {
+                                                         const AravisActionSettings& action,
+                                                         std::shared_ptr<PtpWatch> ptp, const Clock& clock, Warn warn) {
   const std::string name = "camera " + settings.id;
   if (ARV_IS_GV_DEVICE(device.get()) && !arv_gv_device_is_controller(ARV_GV_DEVICE(device.get())))
     return Error{ErrorCode::busy,
                  name + ": another program controls it" + (address ? " (" + to_text(*address) + ")" : "")};
-  std::shared_ptr<AravisCamera> opened(new AravisCamera(settings, action, clock, std::move(warn)));
+  std::shared_ptr<AravisCamera> opened(new AravisCamera(settings, action, std::move(ptp), clock, std::move(warn)));
   opened->address_ = address;
   GErrorSlot error;
   opened->camera_.reset(arv_camera_new_with_device(device.get(), error.out()));
@@ -197,17 +201,20 @@ Result<void> AravisCamera::make_stream() {
 }
 
 Result<void> AravisCamera::check_packet_size() {
-  if (settings_.packet_size == 0) return {};
   GErrorSlot error;
   const gint passes = static_cast<gint>(arv_camera_gv_get_packet_size(camera_.get(), error.out()));
   if (error) return features_->failed("packet_size", error);
-  if (passes == settings_.packet_size) return {};
+  if (settings_.packet_size == 0 && passes < usual_packet_size)
+    warn("packet_size", "packets of more than " + std::to_string(passes) + " bytes do not pass the network, expected " +
+                            std::to_string(usual_packet_size) +
+                            " at least: small ones cost time, and frames may be late");
+  if (settings_.packet_size == 0 || passes == settings_.packet_size) return {};
   return features_->refuse("packet_size", std::to_string(settings_.packet_size) + ", but packets of more than " +
                                               std::to_string(passes) +
                                               " bytes do not pass the network (its MTU may be too small)");
 }
 
-void AravisCamera::enlarge_socket_buffer() const {
+void AravisCamera::enlarge_socket_buffer() {
   // Aravis does it when the first packet of the first frame has arrived, which is too late for that frame.
   const int socket = find_socket(arv_gv_stream_get_port(ARV_GV_STREAM(stream_.get())));
   if (socket < 0) return;
@@ -218,10 +225,32 @@ void AravisCamera::enlarge_socket_buffer() const {
   setsockopt(socket, SOL_SOCKET, SO_RCVBUF, &wanted, sizeof wanted);
   getsockopt(socket, SOL_SOCKET, SO_RCVBUF, &got, &size);
   got /= 2;  // Linux doubles what is asked for, and says so
-  if (got < wanted && warn_)
-    warn_("camera " + settings_.id + ": socket_buffer_kib: " + std::to_string(settings_.socket_buffer_kib) +
-          ", but the kernel allows " + std::to_string(got / bytes_per_kib) +
-          ": frames may lose packets until net.core.rmem_max is raised to " + std::to_string(wanted));
+  if (got < wanted)
+    warn("socket_buffer_kib", std::to_string(settings_.socket_buffer_kib) + ", but the kernel allows " +
+                                  std::to_string(got / bytes_per_kib) +
+                                  ": frames may lose packets until net.core.rmem_max is raised to " +
+                                  std::to_string(wanted));
+}
+
+/// @param topic     that which the sentence is about; a later one takes its place
+/// @param sentence  empty: all is well again
+void AravisCamera::warn(const std::string& topic, const std::string& sentence) {
+  {
+    const std::lock_guard lock(warnings_mutex_);
+    if (sentence.empty()) {
+      warnings_.erase(topic);
+      return;
+    }
+    warnings_[topic] = topic + ": " + sentence;
+  }
+  if (warn_) warn_("camera " + settings_.id + ": " + topic + ": " + sentence);
+}
+
+std::vector<std::string> AravisCamera::warnings() const {
+  const std::lock_guard lock(warnings_mutex_);
+  std::vector<std::string> sentences;
+  for (const auto& [topic, sentence] : warnings_) sentences.push_back(sentence);
+  return sentences;
 }
 
 bool AravisCamera::is_lost() const {
@@ -334,11 +363,13 @@ void AravisCamera::supervise_ptp() {
   if (!status) return;
   const bool ready = *status == "Slave" || *status == "Master";
   ptp_ready_ = ready ? 1 : 0;
-  if (std::exchange(ptp_status_, *status) != *status && !ready && warn_)
-    warn_("camera " + settings_.id + ": ptp: its clock does not follow the network's, its state is " + *status);
+  if (std::exchange(ptp_status_, *status) != *status)
+    warn("ptp", ready ? "" : "its clock does not follow the network's, its state is " + *status);
+  if (const auto masters = ptp_->note(settings_.id, *status); masters && warn_) warn_(*masters);
 }
 
 Result<void> AravisCamera::arm(const CaptureSettings& settings, int count) {
+  worker_ = std::this_thread::get_id();
   if (is_lost()) return lost();
   if (settings.mode == CaptureMode::triggered && count < 1)
     return Error{ErrorCode::invalid_argument,
@@ -382,8 +413,9 @@ void AravisCamera::stop() noexcept {
     waiting = events_->waiting;
   }
   events_->changed.notify_all();
-  // Whoever waits ends the acquisition on the way out, so that stop() does not have to wait for the camera.
-  if (waiting || is_lost()) return;
+  // A camera that hangs takes seconds to say nothing. Only the thread that works with it waits for that: it ends the
+  // acquisition on its way out of wait_frame, or at its next call.
+  if (waiting || is_lost() || worker_ != std::this_thread::get_id()) return;
   const std::lock_guard lock(control_);
   if (!end_acquisition()) announce_loss();
 }
@@ -445,10 +477,11 @@ std::optional<Result<Frame>> AravisCamera::judge(Received received) {
     return Error{ErrorCode::invalid_file, "camera " + settings_.id + ": a frame arrived damaged: " + what};
   }
   const Timestamp triggered = received.exposed - static_cast<Timestamp>(settings_.trigger_delay_us * 1000);
+  const Timestamp unsure = clock_uncertainty();
   FrameMatcher::Match match;
   {
     const std::lock_guard lock(events_->mutex);
-    match = events_->matcher.match(received.frame_id, triggered, clock_.now());
+    match = events_->matcher.match(received.frame_id, triggered, unsure, clock_.now());
   }
   if (match.verdict == FrameMatcher::Verdict::wait) {
     held_ = received;
@@ -538,6 +571,11 @@ Result<void> AravisCamera::fire_software() {
 std::optional<int64_t> AravisCamera::device_time(Timestamp when) const {
   const std::lock_guard lock(clock_mutex_);
   return device_clock_.device_time(when);
+}
+
+Timestamp AravisCamera::clock_uncertainty() const {
+  const std::lock_guard lock(clock_mutex_);
+  return device_clock_.has_readings() ? device_clock_.uncertainty_ns() : 0;
 }
 
 Result<void> AravisCamera::check_presence() const {

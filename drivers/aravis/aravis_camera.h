@@ -6,10 +6,12 @@
 #include <condition_variable>
 #include <deque>
 #include <functional>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <optional>
 #include <string>
+#include <thread>
 #include <vector>
 
 #include "drivers/aravis/aravis_settings.h"
@@ -17,6 +19,7 @@
 #include "drivers/aravis/device_clock.h"
 #include "drivers/aravis/frame_matcher.h"
 #include "drivers/aravis/gobject.h"
+#include "drivers/aravis/ptp_watch.h"
 #include "drivers/camera.h"
 #include "drivers/clock.h"
 
@@ -34,10 +37,12 @@ class AravisCamera {
 
   /// Takes the device over, configures it, and makes its stream.
   /// @param address  of a GigE camera, to see whether it is still there; nothing for USB
+  /// @param ptp      of all cameras of the source
   /// @error as Features; busy  another program controls it
   static Result<std::shared_ptr<AravisCamera>> open(GObjectPtr<ArvDevice> device, std::optional<in_addr> address,
                                                     const AravisCameraSettings& settings,
-                                                    const AravisActionSettings& action, const Clock& clock, Warn warn);
+                                                    const AravisActionSettings& action, std::shared_ptr<PtpWatch> ptp,
+                                                    const Clock& clock, Warn warn);
   ~AravisCamera();
   AravisCamera(const AravisCamera&) = delete;
   AravisCamera& operator=(const AravisCamera&) = delete;
@@ -53,12 +58,15 @@ class AravisCamera {
   void note_trigger(int index, Timestamp when) noexcept;
   Result<void> check_presence() const;
   std::vector<Statistic> statistics() const;
+  std::vector<std::string> warnings() const;
   void stop() noexcept;
 
   /// Exposes by an order over the control channel, if it is armed. @error device_lost
   Result<void> fire_software();
   /// An instant of the booth's clock on this camera's; nothing where it cannot be asked for its time.
   std::optional<int64_t> device_time(Timestamp when) const;
+  /// How far off that may be, drift since the last reading aside.
+  Timestamp clock_uncertainty() const;
 
  private:
   /// What Aravis' threads announce; lives as long as any of its callbacks may run.
@@ -80,11 +88,13 @@ class AravisCamera {
     Timestamp exposed = 0;  ///< beginning of the exposure, on the booth's clock
   };
 
-  AravisCamera(const AravisCameraSettings& settings, const AravisActionSettings& action, const Clock& clock, Warn warn);
+  AravisCamera(const AravisCameraSettings& settings, const AravisActionSettings& action, std::shared_ptr<PtpWatch> ptp,
+               const Clock& clock, Warn warn);
   Result<void> configure();
   Result<void> make_stream();
   Result<void> check_packet_size();
-  void enlarge_socket_buffer() const;
+  void enlarge_socket_buffer();
+  void warn(const std::string& topic, const std::string& sentence);
   Result<void> switch_mode(CaptureMode mode);
   Result<void> apply_role(ShotRole role);
   void read_device_clock();
@@ -104,6 +114,7 @@ class AravisCamera {
 
   const AravisCameraSettings settings_;
   const AravisActionSettings action_;
+  const std::shared_ptr<PtpWatch> ptp_;
   const Clock& clock_;
   const Warn warn_;
   CameraInfo info_;
@@ -117,7 +128,8 @@ class AravisCamera {
   std::shared_ptr<BufferPool> pool_;
   std::unique_ptr<Features> features_;
   gulong loss_handler_ = 0;
-  bool acquiring_ = false;  ///< guarded by control_
+  bool acquiring_ = false;                 ///< guarded by control_
+  std::atomic<std::thread::id> worker_{};  ///< the thread that armed it last
 
   mutable std::mutex clock_mutex_;
   DeviceClock device_clock_;  ///< guarded by clock_mutex_
@@ -134,6 +146,9 @@ class AravisCamera {
   std::atomic<double> temperature_ = 0, ptp_ready_ = 0;
   std::atomic<bool> has_temperature_ = false;
   std::string ptp_status_;
+
+  mutable std::mutex warnings_mutex_;
+  std::map<std::string, std::string> warnings_;  ///< by topic; guarded by warnings_mutex_
 };
 
 }  // namespace booth

@@ -48,6 +48,7 @@ struct AravisSource::Content {
   std::mutex mutex;
   std::map<std::string, std::weak_ptr<AravisCamera>> open;  ///< guarded by mutex
   std::set<std::string> opening;                            ///< guarded by mutex
+  const std::shared_ptr<PtpWatch> ptp = std::make_shared<PtpWatch>();
   std::mutex discovery_mutex;
   std::vector<FoundDevice> found;       ///< guarded by discovery_mutex
   std::optional<Timestamp> discovered;  ///< when `found` was asked for; guarded by discovery_mutex
@@ -163,6 +164,7 @@ class AravisCameraHandle final : public Camera {
   void note_trigger(int index, Timestamp when) noexcept override { camera_->note_trigger(index, when); }
   Result<void> check_presence() const override { return camera_->check_presence(); }
   std::vector<Statistic> statistics() const override { return camera_->statistics(); }
+  std::vector<std::string> warnings() const override { return camera_->warnings(); }
   void stop() noexcept override { camera_->stop(); }
 
  private:
@@ -189,7 +191,7 @@ Result<std::shared_ptr<AravisCamera>> AravisSource::Content::open_device(const A
   }
   auto device = address ? open_gige(camera, *address) : open_usb(camera, usb_device);
   if (!device) return device.error();
-  return AravisCamera::open(*std::move(device), address, camera, settings.action, clock, warn);
+  return AravisCamera::open(*std::move(device), address, camera, settings.action, ptp, clock, warn);
 }
 
 Result<std::shared_ptr<AravisSource>> AravisSource::create(const AravisSettings& settings, const Clock& clock,

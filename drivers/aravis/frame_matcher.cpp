@@ -37,22 +37,22 @@ int FrameMatcher::counted(uint64_t frame_id) const {
   return last_->index + static_cast<int>(steps);
 }
 
-std::optional<int> FrameMatcher::trigger_at(Timestamp exposed_ns) const {
+std::optional<int> FrameMatcher::trigger_at(Timestamp exposed_ns, Timestamp unsure_ns) const {
   std::optional<int> nearest;
   Timestamp least = 0;
   for (const auto& [index, when] : triggers_) {
     const Timestamp late = exposed_ns - when;
-    if (late < -options_.early_ns || late > options_.late_ns) continue;
+    if (late < -options_.early_ns - unsure_ns || late > options_.late_ns + unsure_ns) continue;
     const Timestamp distance = late < 0 ? -late : late;
     if (!nearest || distance < least) nearest = index, least = distance;
   }
   return nearest;
 }
 
-FrameMatcher::Match FrameMatcher::match(uint64_t frame_id, Timestamp exposed_ns, Timestamp now) {
+FrameMatcher::Match FrameMatcher::match(uint64_t frame_id, Timestamp exposed_ns, Timestamp unsure_ns, Timestamp now) {
   Match match{Verdict::answers, counted(frame_id), false};
   if (triggers_are_noted_) {
-    const auto fired = trigger_at(exposed_ns);
+    const auto fired = trigger_at(exposed_ns, unsure_ns);
     if (!fired && !triggers_.contains(match.index) && match.index < count_ && now < wait_until(exposed_ns))
       return {Verdict::wait, match.index, false};
     if (!fired) return {match.index < count_ ? Verdict::unwanted : Verdict::too_many, match.index, true};

@@ -45,7 +45,8 @@ class FrameMatcher {
 
   /// @param frame_id     as the camera numbers it: rising, 16-bit ids without 0
   /// @param exposed_ns   the beginning of the exposure less the trigger delay, on the booth's clock
-  Match match(uint64_t frame_id, Timestamp exposed_ns, Timestamp now);
+  /// @param unsure_ns    how far off that may be
+  Match match(uint64_t frame_id, Timestamp exposed_ns, Timestamp unsure_ns, Timestamp now);
 
   /// The instant until which a frame that had to wait should be kept.
   Timestamp wait_until(Timestamp exposed_ns) const { return exposed_ns + options_.patience_ns; }
@@ -54,7 +55,7 @@ class FrameMatcher {
 
  private:
   int counted(uint64_t frame_id) const;
-  std::optional<int> trigger_at(Timestamp exposed_ns) const;
+  std::optional<int> trigger_at(Timestamp exposed_ns, Timestamp unsure_ns) const;
 
   Options options_;
   int count_ = 0;

@@ -211,22 +211,24 @@ Result<void> ActionSender::send(std::optional<uint64_t> action_time) {
   return {};
 }
 
-std::vector<ActionAcknowledge> ActionSender::await(size_t count, std::chrono::milliseconds patience) const {
+std::vector<ActionAcknowledge> ActionSender::await(const std::vector<in_addr>& cameras,
+                                                   std::chrono::milliseconds patience) const {
   const auto deadline = std::chrono::steady_clock::now() + patience;
   std::vector<ActionAcknowledge> answers;
   std::vector<pollfd> readable;
   for (const Route& route : routes_) readable.push_back({route.socket, POLLIN, 0});
-  while (answers.size() < count) {
+  const auto has_answered = [&](const in_addr& address) {
+    return std::any_of(answers.begin(), answers.end(),
+                       [&](const ActionAcknowledge& answer) { return answer.from.s_addr == address.s_addr; });
+  };
+  while (!std::all_of(cameras.begin(), cameras.end(), has_answered)) {
     const auto left = std::chrono::ceil<std::chrono::milliseconds>(deadline - std::chrono::steady_clock::now());
     if (left.count() <= 0 || poll(readable.data(), readable.size(), static_cast<int>(left.count())) <= 0) break;
     for (const pollfd& ready : readable) {
       if (ready.revents == 0) continue;
       while (const auto datagram = receive(ready.fd)) {
         const auto answer = parse_action_acknowledge(datagram->first, datagram->second, request_);
-        const bool known = answer && std::any_of(answers.begin(), answers.end(), [&](const ActionAcknowledge& a) {
-                             return a.from.s_addr == answer->from.s_addr;
-                           });
-        if (answer && !known) answers.push_back(*answer);
+        if (answer && !has_answered(answer->from)) answers.push_back(*answer);
       }
     }
   }

@@ -54,8 +54,9 @@ class ActionSender {
 
   /// Sends the command to every destination. @error io  nothing could be sent
   Result<void> send(std::optional<uint64_t> action_time);
-  /// Collects acknowledges of the last command until `count` cameras have answered or the time is over.
-  std::vector<ActionAcknowledge> await(size_t count, std::chrono::milliseconds patience) const;
+  /// Collects acknowledges of the last command until these cameras have answered or the time is over. Others on the
+  /// network may answer, too.
+  std::vector<ActionAcknowledge> await(const std::vector<in_addr>& cameras, std::chrono::milliseconds patience) const;
 
  private:
   struct Route {

@@ -21,6 +21,10 @@ namespace {
 /// A camera that is silent for this long, while its stream runs, hangs: opening it anew is what helps.
 constexpr int longest_silence_ms = 5000;
 
+/// A stream that nobody wants any more goes on for this long: it may be wanted again at once, as when a preview makes
+/// way for a capture, and beginning anew costs the first frames.
+constexpr std::chrono::milliseconds stream_linger{1000};
+
 /// The clock cannot wake anybody: who waits for it looks again at least this often.
 constexpr std::chrono::milliseconds longest_nap{100};
 
@@ -78,17 +82,16 @@ V4l2Camera::V4l2Camera(std::unique_ptr<VideoDevice> device, V4l2CameraSettings s
 
 V4l2Camera::~V4l2Camera() {
   stop();
-  if (thread_.joinable()) thread_.join();
+  end_stream();
   device_.reset();
   ::close(wakeup_fd_);
   on_close_();
 }
 
-void V4l2Camera::ask_stream_to_end() noexcept {
-  {
-    const std::lock_guard lock(mutex_);
-    stop_wanted_ = true;
-  }
+/// Its first frames after a pulse are what was asked for.
+int V4l2Camera::warm_up_frames() const { return is_triggered() ? 0 : settings_.warm_up_frames; }
+
+void V4l2Camera::wake_stream() noexcept {
   const uint64_t one = 1;
   // It can only fail when the counter is full, and then the thread is awake already.
   [[maybe_unused]] const auto written = ::write(wakeup_fd_, &one, sizeof one);
@@ -105,12 +108,10 @@ void V4l2Camera::lose(const Error& error) {
 
 Result<void> V4l2Camera::start_stream(const std::optional<int>& exposure_us) {
   end_stream();
-  uint64_t woken = 0;
-  [[maybe_unused]] const auto read = ::read(wakeup_fd_, &woken, sizeof woken);  // nobody may have woken it
   {
     const std::lock_guard lock(mutex_);
     stop_wanted_ = false;
-    warm_up_left_ = settings_.warm_up_frames;
+    warm_up_left_ = warm_up_frames();
     last_sequence_.reset();
   }
   if (auto started = device_->start(settings_.buffers); !started) return started;
@@ -129,13 +130,19 @@ Result<void> V4l2Camera::start_stream(const std::optional<int>& exposure_us) {
 
 void V4l2Camera::end_stream() noexcept {
   if (!thread_.joinable()) return;
-  ask_stream_to_end();
+  {
+    const std::lock_guard lock(mutex_);
+    stop_wanted_ = true;
+  }
+  wake_stream();
   thread_.join();
 }
 
 Result<void> V4l2Camera::arm(const CaptureSettings& settings, int count) {
   if (settings.mode == CaptureMode::triggered && count < 1)
     return Error{ErrorCode::invalid_argument, info_.id + ": cannot be armed for " + std::to_string(count)};
+  if (settings.mode == CaptureMode::preview && is_triggered())
+    return Error{ErrorCode::unsupported, info_.id + ": has no preview: it exposes only when its line is pulsed"};
   if (const auto present = check_presence(); !present) return present.error();
   const bool gray_code = settings.role == ShotRole::gray_code;
   const std::optional<int> exposure_us =
@@ -145,6 +152,7 @@ Result<void> V4l2Camera::arm(const CaptureSettings& settings, int count) {
   {
     const std::lock_guard lock(mutex_);
     armed_ = false;
+    unwanted_since_.reset();
     newest_.reset();
     choice_.reset();
     streaming = streaming_ && !stop_wanted_;
@@ -157,7 +165,7 @@ Result<void> V4l2Camera::arm(const CaptureSettings& settings, int count) {
   } else if (!same_exposure) {
     ready = device_->apply_controls(settings_, exposure_us);
     const std::lock_guard lock(mutex_);
-    warm_up_left_ = settings_.warm_up_frames;
+    warm_up_left_ = warm_up_frames();
   }
   if (ready.ok()) ready = warm_up();
   if (!ready) {
@@ -190,26 +198,40 @@ Result<void> V4l2Camera::warm_up() {
   return {};
 }
 
-bool V4l2Camera::is_stop_wanted() const {
+/// How long the stream's thread may wait for a frame, milliseconds, −1 for ever; nothing: the stream is to end.
+std::optional<int> V4l2Camera::stream_patience() {
   const std::lock_guard lock(mutex_);
-  return stop_wanted_;
+  // A camera that waits for a trigger of its own may be silent.
+  const int patience = is_triggered() ? -1 : longest_silence_ms;
+  if (stop_wanted_) return std::nullopt;
+  if (!unwanted_since_) return patience;
+  const auto left =
+      std::chrono::ceil<std::chrono::milliseconds>(*unwanted_since_ + stream_linger - std::chrono::steady_clock::now());
+  if (left.count() <= 0) {
+    stop_wanted_ = true;
+    return std::nullopt;
+  }
+  return static_cast<int>(left.count());
 }
 
 void V4l2Camera::stream() {
   pollfd polled[] = {{device_->descriptor(), POLLIN, 0}, {wakeup_fd_, POLLIN, 0}};
-  // A camera that waits for a trigger of its own may be silent.
-  const int patience = settings_.warm_up_frames == 0 ? -1 : longest_silence_ms;
-  while (!is_stop_wanted()) {
-    const int ready = ::poll(polled, std::size(polled), patience);
+  while (const auto patience = stream_patience()) {
+    const int ready = ::poll(polled, std::size(polled), *patience);
     if (ready < 0 && errno == EINTR) continue;
     if (ready < 0) {
       lose({ErrorCode::device_lost, info_.id + ": cannot be waited for: " + std::strerror(errno)});
       break;
     }
+    if (ready == 0 && *patience < longest_silence_ms) continue;
     if (ready == 0) {
       lose({ErrorCode::device_lost,
             info_.id + ": has delivered no frame for " + std::to_string(longest_silence_ms / 1000) + " s"});
       break;
+    }
+    if (polled[1].revents != 0) {
+      uint64_t woken = 0;
+      [[maybe_unused]] const auto read = ::read(wakeup_fd_, &woken, sizeof woken);
     }
     if (polled[0].revents == 0) continue;
     if (const auto drained = drain(); !drained) {
@@ -228,6 +250,11 @@ void V4l2Camera::stream() {
   streaming_ = false;
 }
 
+bool V4l2Camera::takes_frames() const {
+  const std::lock_guard lock(mutex_);
+  return armed_ && warm_up_left_ == 0;
+}
+
 Result<void> V4l2Camera::drain() {
   while (true) {
     const auto filled = device_->dequeue();
@@ -238,7 +265,7 @@ Result<void> V4l2Camera::drain() {
     std::string damage = damage_of(buffer, device_->mode(), whole);
     // The buffer goes back at once: held any longer, the device would run out of them and lose frames.
     std::vector<uint8_t> bytes;
-    if (damage.empty()) bytes.assign(whole.begin(), whole.end());
+    if (damage.empty() && takes_frames()) bytes.assign(whole.begin(), whole.end());
     if (auto enqueued = device_->enqueue(buffer); !enqueued) return enqueued;
     Timestamp begin = buffer.timestamp_ns - int64_t{settings_.latency_us} * 1000;
     if (buffer.stamped_at_end) {
@@ -383,9 +410,10 @@ void V4l2Camera::stop() noexcept {
     armed_ = false;
     newest_.reset();
     choice_.reset();
+    if (!unwanted_since_) unwanted_since_ = std::chrono::steady_clock::now();
     changed_.notify_all();
   }
-  ask_stream_to_end();
+  wake_stream();
 }
 
 }  // namespace booth

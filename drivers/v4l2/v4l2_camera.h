@@ -1,6 +1,6 @@
 #pragma once
 
-#include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <functional>
 #include <memory>
@@ -18,7 +18,7 @@
 
 namespace booth {
 
-/// A camera that streams while it is armed, on a thread of its own; see V4l2Source.
+/// A camera that streams while it is armed and a little longer, on a thread of its own; see V4l2Source.
 class V4l2Camera final : public Camera {
  public:
   /// @param device    opened, its controls applied
@@ -48,9 +48,12 @@ class V4l2Camera final : public Camera {
   Result<void> start_stream(const std::optional<int>& exposure_us);
   void end_stream() noexcept;
   Result<void> warm_up();
-  void ask_stream_to_end() noexcept;
+  bool is_triggered() const { return settings_.trigger == V4l2TriggerSource::line; }
+  int warm_up_frames() const;
+  void wake_stream() noexcept;
   void stream();
-  bool is_stop_wanted() const;
+  std::optional<int> stream_patience();
+  bool takes_frames() const;
   Result<void> drain();
   void take(const FilledBuffer& buffer, Timestamp begin, std::vector<uint8_t> bytes, std::string damage);
   void lose(const Error& error);
@@ -63,7 +66,7 @@ class V4l2Camera final : public Camera {
   const Clock& clock_;
   const std::function<void()> on_close_;
   std::unique_ptr<VideoDevice> device_;
-  int wakeup_fd_;  ///< an eventfd that ends the stream thread's waiting
+  int wakeup_fd_;  ///< an eventfd that interrupts the stream thread's waiting
 
   mutable std::mutex mutex_;
   std::condition_variable changed_;
@@ -72,6 +75,7 @@ class V4l2Camera final : public Camera {
   bool armed_ = false;
   bool streaming_ = false;
   bool stop_wanted_ = false;
+  std::optional<std::chrono::steady_clock::time_point> unwanted_since_;  ///< while nobody wants the stream
   bool preview_ = false;
   std::optional<FrameChoice> choice_;    ///< of the triggered frames
   std::optional<StreamedFrame> newest_;  ///< of the preview
@@ -82,7 +86,8 @@ class V4l2Camera final : public Camera {
   std::optional<uint32_t> last_sequence_;
   Counters counters_;
 
-  std::jthread thread_;  ///< started by arm, ended by stop, joined by arm and the destructor
+  std::jthread
+      thread_;  ///< started by arm; ends when nobody wants the stream any more; joined by arm and the destructor
 };
 
 }  // namespace booth

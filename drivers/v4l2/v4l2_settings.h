@@ -20,6 +20,10 @@ std::string_view to_string(V4l2Format format);
 /// The format of that name, if it is one.
 std::optional<V4l2Format> v4l2_format_from(std::string_view name);
 
+/// What makes a camera expose: nothing, it streams all the time and a trigger chooses a frame; or a line of its own,
+/// for which its maker's controls must have been set.
+enum class V4l2TriggerSource { stream, line };
+
 /// One USB camera. Exactly one of `device`, `serial` and `bus` says which. What is left out of the optional values
 /// stays as the camera has it, its automatics included; whatever is set is verified by reading it back.
 struct V4l2CameraSettings {
@@ -44,9 +48,10 @@ struct V4l2CameraSettings {
   /// units; booleans are 0 and 1, a menu's entries are numbered.
   std::map<std::string, int64_t> controls = {};
 
+  /// A camera with a line of its own has no preview, and its stream is not waited for.
+  V4l2TriggerSource trigger = V4l2TriggerSource::stream;
   int buffers = 4;          ///< that the kernel fills in turn, 2 … 32
-  int warm_up_frames = 2;   ///< first ones of a stream, which are not used, 0 … 100. 0 for a camera that waits for a
-                            ///< trigger of its own: then arming does not wait for frames
+  int warm_up_frames = 2;   ///< first ones of a stream, which are not used, 0 … 100; none where a line triggers
   int latency_us = 0;       ///< from the beginning of the exposure to the driver's time stamp, 0 … 1'000'000
   int max_offset_ms = 100;  ///< a frame farther from its trigger does not answer it, 1 … 60000
 };

@@ -182,7 +182,7 @@ constexpr const char* mixture = R"(
       id = "body-03"
       driver = "replay"
       [trigger]
-      driver = "gpio"
+      driver = "aravis"
       [trigger.gpio]
       chip = "gpio-sim"
       line = "4"
@@ -267,6 +267,23 @@ TEST(ParseConfig, TriggersAndProjectorsMustFitTheCameras) {
               ElementsAre(HasSubstr("no camera has the trigger software or action")));
   EXPECT_THAT(faults_of(usb + "[trigger]\ndriver = \"gpio\"\n[projector]\ndriver = \"none\"\n"),
               ElementsAre(HasSubstr("trigger.gpio: ")));
+
+  const auto gige = [](const std::string& id, const std::string& trigger) {
+    return "[[cameras]]\nid = \"" + id + "\"\ndriver = \"aravis\"\nserial = \"" + id + "\"\ntrigger = \"" + trigger +
+           "\"\n[projector]\ndriver = \"none\"\n";
+  };
+  const std::string other = "[[cameras]]\nid = \"b\"\ndriver = \"aravis\"\nserial = \"b\"\ntrigger = ";
+  const std::string orders = "[trigger]\ndriver = \"aravis\"\n";
+  EXPECT_THAT(faults_of(orders + gige("a", "action") + other + "\"action\"\n"), IsEmpty());
+  EXPECT_THAT(faults_of(orders + gige("a", "action") + other + "\"line\"\n"),
+              ElementsAre("trigger.driver: \"aravis\", expected the trigger software or action of every camera, not "
+                          "\"line\""));
+  EXPECT_THAT(
+      faults_of(orders + gige("a", "action") + other + "\"software\"\n"),
+      ElementsAre("trigger.driver: \"aravis\", expected one trigger for all cameras, either software or action"));
+  EXPECT_THAT(faults_of("[trigger]\ndriver = \"none\"\n" + gige("a", "software")),
+              ElementsAre("trigger.driver: another than \"aravis\", expected the trigger \"line\" of every camera: "
+                          "software and action are for \"aravis\""));
 }
 
 TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {

@@ -53,6 +53,7 @@ class FakeDevices final : public DeviceSource, public std::enable_shared_from_th
     std::optional<Error> refusal;                  ///< of open_camera
     int width = FakeDevices::width;                ///< of what it delivers
     bool blind = false;                            ///< shows no preview
+    std::vector<std::string> warnings;
     std::deque<std::pair<Timestamp, Result<Frame>>> arrivals;
     int previewed = 0;
     std::function<void(Image&)> paint;  ///< what its triggered frames show
@@ -229,6 +230,10 @@ class FakeCamera final : public Camera {
     return channel_.lost ? Result<void>(gone()) : Result<void>();
   }
   std::vector<Statistic> statistics() const override { return {{"n_missing_packets", 3}}; }
+  std::vector<std::string> warnings() const override {
+    const std::lock_guard lock(devices_->mutex_);
+    return channel_.warnings;
+  }
   void stop() noexcept override {
     const std::lock_guard lock(devices_->mutex_);
     channel_.armed = false;

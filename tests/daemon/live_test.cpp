@@ -40,6 +40,7 @@ class Live : public TestBooth {
     Devices devices;
     devices.source = fake_;
     devices.drivers = {{"fake", fake_}};
+    devices.warnings = warnings_;
     for (const std::string& id : configured_) devices.cameras.push_back(fake_->see(id).info);
     devices.trigger = "fake";
     devices.projector = "beamer";
@@ -112,6 +113,7 @@ class Live : public TestBooth {
   std::vector<std::string> configured_ = all_cameras;
   std::optional<Rig> rig_;
   std::shared_ptr<FakeDevices> fake_;
+  const std::shared_ptr<WarningRelay> warnings_ = std::make_shared<WarningRelay>();
   std::unique_ptr<Listener> listener_;
   std::string failure_;
 };
@@ -417,6 +419,24 @@ TEST_F(Live, ACameraThatTheCalibrationDoesNotKnowIsAReason) {
 TEST_F(Live, TransportStatisticsAreInTheMetrics) {
   begin();
   EXPECT_TRUE(wait_until([&] { return call("system.metrics").value("camera_b0_n_missing_packets", 0) == 3; }));
+}
+
+TEST_F(Live, WhatDriversWarnOfIsAnAlertAndInTheCamerasStatus) {
+  warnings_->warn("camera b9: before anybody listened");
+  begin();
+  fake_->change("b0", [](auto& channel) { channel.warnings = {"packet_size: packets of more than 576 bytes …"}; });
+  ASSERT_TRUE(wait_until([&] { return camera("b0")["warnings"].size() == 1; }));
+  EXPECT_EQ(camera("b0")["state"], "online");
+  EXPECT_THAT(camera("b1")["warnings"], IsEmpty());
+  fake_->change("b0", [](auto& channel) { channel.warnings.clear(); });
+  EXPECT_TRUE(wait_until([&] { return camera("b0")["warnings"].empty(); }));
+  warnings_->warn("camera b0: did not acknowledge the action command");
+  const auto alert = listener_->find([](const SeenEvent& event) {
+    return event.topic == "alert" && event.fields["message"] == "camera b0: did not acknowledge the action command";
+  });
+  ASSERT_TRUE(alert);
+  EXPECT_EQ(alert->fields["severity"], "warning");
+  EXPECT_EQ(call("system.metrics")["driver_warnings"], 2);
 }
 
 TEST_F(Live, DiscoverTellsOfEveryCamera) {

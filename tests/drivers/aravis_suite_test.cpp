@@ -582,6 +582,84 @@ TEST_F(AravisSuite, ActionCommandsFireAllAndMissingAcknowledgesAreNamed) {
   for (const auto& peer : peers) peer->mute(false);
 }
 
+TEST_F(AravisSuite, AScheduledActionExposesAllAtItsInstant) {
+  for (int i = 0; i < 3; ++i) add_camera({.shares_clock = true});
+  settings.action = {.schedule_ahead_us = 300'000, .acknowledge_timeout_ms = 5000};
+  std::vector<std::unique_ptr<Camera>> cameras;
+  for (AravisCameraSettings& camera : settings.cameras) camera.trigger = AravisTriggerSource::action;
+  for (int i = 0; i < 3; ++i) {
+    cameras.push_back(open(i));
+    ASSERT_TRUE(cameras.back() && arm(*cameras.back(), 1));
+  }
+  auto trigger = source->open_trigger();
+  ASSERT_TRUE(trigger) << trigger.error().message;
+  const Timestamp asked = clock.now();
+  const auto fired = (*trigger)->fire();
+  ASSERT_TRUE(fired) << fired.error().message;
+  EXPECT_GE(*fired, asked + milliseconds(300));
+  for (const auto& camera : cameras) {
+    camera->note_trigger(0, *fired);
+    const auto frame = camera->wait_frame(soon());
+    ASSERT_TRUE(frame) << frame.error().message;
+    // As exactly as the clocks could be compared, of which two comparisons are in it.
+    const auto unsure = static_cast<Timestamp>(3000 * statistic(*camera, "clock_uncertainty_us")) + 100'000;
+    EXPECT_NEAR(static_cast<double>(frame->timestamp_ns - *fired), 0, static_cast<double>(unsure));
+  }
+}
+
+TEST_F(AravisSuite, AnActionIsNotScheduledByClocksThatDoNotAgree) {
+  add_camera();
+  std::this_thread::sleep_for(std::chrono::milliseconds(300));  // each clock begins when its camera is switched on
+  add_camera();
+  settings.action = {.schedule_ahead_us = 300'000};
+  for (AravisCameraSettings& camera : settings.cameras) camera.trigger = AravisTriggerSource::action;
+  const auto first = open(0), second = open(1);
+  ASSERT_TRUE(first && second && arm(*first, 1) && arm(*second, 1));
+  const auto fired = (*source->open_trigger())->fire();
+  ASSERT_FALSE(fired);
+  EXPECT_THAT(fired.error().message, AllOf(HasSubstr("action: schedule_ahead_us: the clocks of cam-0 and cam-1 are "),
+                                           HasSubstr(" ms apart: they must follow one PTP master")));
+}
+
+TEST_F(AravisSuite, ACameraThatHangsDelaysNeitherTheOthersNorTheTrigger) {
+  GigeCamera& hung = add_camera();
+  add_camera();
+  for (AravisCameraSettings& camera : settings.cameras) camera.trigger = AravisTriggerSource::software;
+  const auto first = open(0), second = open(1);
+  ASSERT_TRUE(first && second && arm(*first, 2) && arm(*second, 2));
+  auto trigger = source->open_trigger();
+  ASSERT_TRUE(trigger) << trigger.error().message;
+  hung.mute(true);
+  for (int i = 0; i < 2; ++i) {
+    const auto fired = (*trigger)->fire();
+    ASSERT_TRUE(fired) << fired.error().message;
+    second->note_trigger(i, *fired);
+    const auto frame = second->wait_frame(soon());
+    ASSERT_TRUE(frame) << frame.error().message;
+    EXPECT_EQ(frame->index, i);
+  }
+  EXPECT_THAT(all_warnings(), testing::ElementsAre("camera cam-0: has not confirmed the order to expose"))
+      << "it was asked once only";
+  // Whoever else stops it does not wait for it either: its control channel is silent for seconds.
+  const Timestamp asked = clock.now();
+  std::jthread([&] { first->stop(); }).join();
+  EXPECT_LT(clock.now() - asked, seconds(1));
+  hung.mute(false);
+}
+
+TEST_F(AravisSuite, WarningsLastAsLongAsTheirCause) {
+  GigeCamera& peer = add_camera({.path_mtu = 1000});
+  settings.cameras[0].packet_size = 0;
+  settings.cameras[0].ptp = true;
+  const auto camera = open();
+  ASSERT_TRUE(camera && arm(*camera, 1));
+  EXPECT_THAT(camera->warnings(), testing::ElementsAre(HasSubstr("packet_size: packets of more than "),
+                                                       HasSubstr("ptp: its clock does not follow the network's")));
+  peer.set_ptp_status("Slave");
+  ASSERT_TRUE(arm(*camera, 1));
+  EXPECT_THAT(camera->warnings(), testing::ElementsAre(HasSubstr("packet_size: ")));
+}
+
 TEST_F(AravisSuite, TimestampsFollowAClockOfAnotherRate) {
   add_camera({.tick_frequency = 125'000'000, .clock_error_ppm = 200});
   const auto camera = open();

@@ -8,6 +8,7 @@
 #include "drivers/aravis/device_clock.h"
 #include "drivers/aravis/frame_matcher.h"
 #include "drivers/aravis/gvcp.h"
+#include "drivers/aravis/ptp_watch.h"
 
 namespace booth {
 namespace {
@@ -143,64 +144,84 @@ TEST(DeviceClock, ArrivalsBoundItWhereItCannotBeAsked) {
 
 constexpr Timestamp second = seconds(1);
 
+TEST(FrameMatcher, AnUncertainClockWidensWhatATriggerExplains) {
+  FrameMatcher matcher;
+  matcher.begin(2);
+  matcher.note_trigger(0, second);
+  const Timestamp early = second - milliseconds(20);
+  EXPECT_EQ(matcher.match(1, early, 0, second * 2).verdict, Verdict::unwanted);
+  EXPECT_EQ(matcher.match(1, early, milliseconds(16), second * 2).verdict, Verdict::answers);
+}
+
+TEST(PtpWatch, NamesSeveralMastersOnce) {
+  PtpWatch watch;
+  EXPECT_EQ(watch.note("a", "Master"), std::nullopt);
+  EXPECT_EQ(watch.note("b", "Slave"), std::nullopt);
+  EXPECT_EQ(watch.note("c", "Master"),
+            "ptp: a, c are all masters, so that their clocks do not agree: they must be on one network");
+  EXPECT_EQ(watch.note("c", "Master"), std::nullopt) << "that was said";
+  EXPECT_EQ(watch.note("a", "Slave"), std::nullopt);
+  EXPECT_TRUE(watch.note("a", "Master"));
+}
+
 TEST(FrameMatcher, CountsWhereNoTriggerIsNoted) {
   FrameMatcher matcher;
   matcher.begin(3);
   for (int i = 0; i < 3; ++i) {
-    const auto match = matcher.match(static_cast<uint64_t>(17 + i), second * i, second * i);
+    const auto match = matcher.match(static_cast<uint64_t>(17 + i), second * i, 0, second * i);
     EXPECT_EQ(match.verdict, Verdict::answers);
     EXPECT_EQ(match.index, i);
   }
-  EXPECT_EQ(matcher.match(20, second * 3, second * 3).verdict, Verdict::too_many);
+  EXPECT_EQ(matcher.match(20, second * 3, 0, second * 3).verdict, Verdict::too_many);
 }
 
 TEST(FrameMatcher, AGapInTheIdsIsALostFrame) {
   FrameMatcher matcher;
   matcher.begin(10);
-  EXPECT_EQ(matcher.match(65534, 0, 0).index, 0);
-  matcher.note_damaged();                      // 65535
-  EXPECT_EQ(matcher.match(1, 0, 0).index, 2);  // ids go round without 0
-  EXPECT_EQ(matcher.match(5, 0, 0).index, 6);
+  EXPECT_EQ(matcher.match(65534, 0, 0, 0).index, 0);
+  matcher.note_damaged();                         // 65535
+  EXPECT_EQ(matcher.match(1, 0, 0, 0).index, 2);  // ids go round without 0
+  EXPECT_EQ(matcher.match(5, 0, 0, 0).index, 6);
   matcher.begin(10);
   matcher.note_damaged();
   matcher.note_damaged();
-  EXPECT_EQ(matcher.match(3, 0, 0).index, 2) << "damaged frames answered triggers, too";
+  EXPECT_EQ(matcher.match(3, 0, 0, 0).index, 2) << "damaged frames answered triggers, too";
 }
 
 TEST(FrameMatcher, CamerasWithoutIdsAreCounted) {
   FrameMatcher matcher;
   matcher.begin(3);
-  for (int i = 0; i < 3; ++i) EXPECT_EQ(matcher.match(0, 0, 0).index, i);
+  for (int i = 0; i < 3; ++i) EXPECT_EQ(matcher.match(0, 0, 0, 0).index, i);
 }
 
 TEST(FrameMatcher, TheInstantDecidesWhereTheCountSlipped) {
   FrameMatcher matcher;
   matcher.begin(4);
   for (int i = 0; i < 4; ++i) matcher.note_trigger(i, second * (i + 1));
-  EXPECT_EQ(matcher.match(1, second + 400, second).index, 0);
+  EXPECT_EQ(matcher.match(1, second + 400, 0, second).index, 0);
   // Trigger 1 was not seen by the camera, so it did not count it either.
-  const auto slipped = matcher.match(2, second * 3 + 400, second * 3);
+  const auto slipped = matcher.match(2, second * 3 + 400, 0, second * 3);
   EXPECT_EQ(slipped.verdict, Verdict::answers);
   EXPECT_EQ(slipped.index, 2);
   EXPECT_TRUE(slipped.slipped);
-  EXPECT_EQ(matcher.match(3, second * 4 + 400, second * 4).index, 3);
+  EXPECT_EQ(matcher.match(3, second * 4 + 400, 0, second * 4).index, 3);
 }
 
 TEST(FrameMatcher, AFrameThatNothingTriggeredIsUnwanted) {
   FrameMatcher matcher;
   matcher.begin(3);
   matcher.note_trigger(0, second);
-  EXPECT_EQ(matcher.match(1, second + 400, second).index, 0);
+  EXPECT_EQ(matcher.match(1, second + 400, 0, second).index, 0);
   // Noise on the line half a second later: perhaps its trigger is yet to be noted, but not for ever.
   const Timestamp noise = second + second / 2;
-  EXPECT_EQ(matcher.match(2, noise, noise + 1000).verdict, Verdict::wait);
-  EXPECT_EQ(matcher.match(2, noise, matcher.wait_until(noise)).verdict, Verdict::unwanted);
+  EXPECT_EQ(matcher.match(2, noise, 0, noise + 1000).verdict, Verdict::wait);
+  EXPECT_EQ(matcher.match(2, noise, 0, matcher.wait_until(noise)).verdict, Verdict::unwanted);
   matcher.note_trigger(1, second * 2);
-  const auto next = matcher.match(3, second * 2 + 400, second * 2);
+  const auto next = matcher.match(3, second * 2 + 400, 0, second * 2);
   EXPECT_EQ(next.verdict, Verdict::answers);
   EXPECT_EQ(next.index, 1);
   // Twice for one trigger.
-  EXPECT_EQ(matcher.match(4, second * 2 + 900, second * 3).verdict, Verdict::unwanted);
+  EXPECT_EQ(matcher.match(4, second * 2 + 900, 0, second * 3).verdict, Verdict::unwanted);
 }
 
 TEST(FrameMatcher, AFrameMayComeBeforeItsTriggerIsNoted) {
@@ -208,9 +229,9 @@ TEST(FrameMatcher, AFrameMayComeBeforeItsTriggerIsNoted) {
   matcher.begin(1);
   matcher.note_trigger(0, second);
   matcher.begin(1);
-  EXPECT_EQ(matcher.match(1, second * 2, second * 2 + 1000).verdict, Verdict::wait);
+  EXPECT_EQ(matcher.match(1, second * 2, 0, second * 2 + 1000).verdict, Verdict::wait);
   matcher.note_trigger(0, second * 2 - 100);
-  EXPECT_EQ(matcher.match(1, second * 2, second * 2 + 2000).index, 0);
+  EXPECT_EQ(matcher.match(1, second * 2, 0, second * 2 + 2000).index, 0);
 }
 
 TEST(FrameMatcher, KnowsWhatIsOwed) {
@@ -220,7 +241,7 @@ TEST(FrameMatcher, KnowsWhatIsOwed) {
   matcher.note_trigger(0, second);
   EXPECT_FALSE(matcher.owes_answer(second - 1));
   EXPECT_TRUE(matcher.owes_answer(second));
-  EXPECT_EQ(matcher.match(1, second, second).verdict, Verdict::answers);
+  EXPECT_EQ(matcher.match(1, second, 0, second).verdict, Verdict::answers);
   EXPECT_FALSE(matcher.owes_answer(second * 9));
   matcher.note_trigger(1, second * 2);
   EXPECT_FALSE(matcher.owes_answer(second * 9)) << "it is not armed for that one";

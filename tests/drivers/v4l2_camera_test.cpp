@@ -424,13 +424,44 @@ TEST_F(V4l2, WarmUpFramesAreNotUsed) {
   EXPECT_GE(sent, 3);
 }
 
-TEST_F(V4l2, ItStreamsOnlyWhileItIsArmed) {
+TEST_F(V4l2, AStreamThatNobodyWantsEnds) {
   const auto camera = armed(settings());
   EXPECT_TRUE(system->streams(node));
   camera->stop();
   while (system->streams(node)) std::this_thread::yield();
   ASSERT_TRUE(camera->arm({}, 1));
   EXPECT_TRUE(system->streams(node));
+}
+
+TEST_F(V4l2, APreviewMakesWayWithoutANewStream) {
+  auto warm = settings();
+  warm.warm_up_frames = 1;
+  auto camera = open(warm);
+  ASSERT_TRUE(camera);
+  {
+    std::atomic<bool> is_armed = false;
+    std::jthread arming([&] {
+      EXPECT_TRUE((*camera)->arm({.mode = CaptureMode::preview}, 1));
+      is_armed = true;
+    });
+    while (!is_armed) system->send(node, jpeg(), clock.now());
+  }
+  (*camera)->stop();
+  // No frame comes: a stream that began anew would wait for its first one in vain.
+  EXPECT_TRUE((*camera)->arm({}, 1));
+  EXPECT_TRUE(system->streams(node));
+}
+
+TEST_F(V4l2, ACameraWithALineOfItsOwnHasNoPreviewAndIsNotWaitedFor) {
+  auto wired = settings();
+  wired.trigger = V4l2TriggerSource::line;
+  wired.warm_up_frames = 3;
+  auto camera = open(wired);
+  ASSERT_TRUE(camera);
+  const auto preview = (*camera)->arm({.mode = CaptureMode::preview}, 1);
+  EXPECT_EQ(preview.error().code, ErrorCode::unsupported);
+  EXPECT_THAT(preview.error().message, HasSubstr("has no preview: it exposes only when its line is pulsed"));
+  EXPECT_TRUE((*camera)->arm({}, 1)) << "though no frame comes";
 }
 
 /// Sends frames as a camera does that streams all the time.

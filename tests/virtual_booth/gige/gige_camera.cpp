@@ -42,6 +42,7 @@ enum Status : uint16_t {
 };
 constexpr uint16_t gvcp_port = 3956;
 constexpr uint8_t acknowledge_asked = 0x01;
+constexpr uint8_t scheduled = 0x80;  ///< an action command says when
 
 /// Bootstrap registers of the standard, and the features' own, as camera.xml has them.
 enum Register : uint32_t {
@@ -244,11 +245,12 @@ class GigeCamera::Device {
     else
       leave_unanswered();
   }
-  void expose() {
+  void expose() { expose(monotonic_ns()); }
+  void expose(uint64_t when) {
     if (!acquiring_ || pending_) return leave_unanswered();
     const auto delay_ns = static_cast<uint64_t>(real(trigger_delay) * 1000);
     const auto exposure_ns = static_cast<uint64_t>(real(exposure_time) * 1000);
-    const uint64_t begin = monotonic_ns() + delay_ns;
+    const uint64_t begin = when + delay_ns;
     pending_ = Exposure{begin, begin + exposure_ns};
     tell_([](GigeCameraReport& report) { ++report.exposures; });
   }
@@ -404,9 +406,15 @@ class GigeCamera::Device {
     if (is_free_running() && !pending_) bound(next_free_);
     return {static_cast<time_t>(wait / 1'000'000'000), static_cast<long>(wait % 1'000'000'000)};
   }
+  double ticks_per_ns() const {
+    return (1 + options_.clock_error_ppm * 1e-6) * (static_cast<double>(options_.tick_frequency) / 1e9);
+  }
+  uint64_t clock_zero() const { return options_.shares_clock ? 0 : powered_on_ns_; }
   uint64_t ticks(uint64_t monotonic) const {
-    const double elapsed = static_cast<double>(monotonic - powered_on_ns_) * (1 + options_.clock_error_ppm * 1e-6);
-    return static_cast<uint64_t>(elapsed * (static_cast<double>(options_.tick_frequency) / 1e9));
+    return static_cast<uint64_t>(static_cast<double>(monotonic - clock_zero()) * ticks_per_ns());
+  }
+  uint64_t monotonic_at(uint64_t ticks) const {
+    return clock_zero() + static_cast<uint64_t>(static_cast<double>(ticks) / ticks_per_ns());
   }
 
   // The control channel.
@@ -426,7 +434,7 @@ class GigeCamera::Device {
 
     uint16_t status = success;
     const uint8_t* data = in.data() + 8;
-    const size_t answer = obey(command, data, size, !controller_ || is_controller, out.data() + 8, status);
+    const size_t answer = obey(command, in[1], data, size, !controller_ || is_controller, out.data() + 8, status);
     const bool wrote = status == success && (command == write_register || command == write_memory);
     if (wrote) react_to_write(from);
     if ((in[1] & acknowledge_asked) != 0 && command != packet_resend) {
@@ -440,7 +448,8 @@ class GigeCamera::Device {
   }
 
   /// @return how many bytes of answer it wrote to `out`
-  size_t obey(uint16_t command, const uint8_t* data, uint16_t size, bool may_write, uint8_t* out, uint16_t& status) {
+  size_t obey(uint16_t command, uint8_t flags, const uint8_t* data, uint16_t size, bool may_write, uint8_t* out,
+              uint16_t& status) {
     constexpr uint32_t largest_block = 536;
     switch (command) {
       case discovery: {
@@ -485,7 +494,11 @@ class GigeCamera::Device {
         return 4;
       }
       case action:
-        if (size >= 12) act(get32(data), get32(data + 4), get32(data + 8), status);
+        if (size < 12 || ((flags & scheduled) != 0 && size < 20)) return status = invalid_parameter, 0;
+        act(get32(data), get32(data + 4), get32(data + 8),
+            (flags & scheduled) != 0 ? monotonic_at(uint64_t{get32(data + 12)} << 32 | get32(data + 16))
+                                     : monotonic_ns(),
+            status);
         return 0;
       default: return status = not_implemented, 0;
     }
@@ -547,12 +560,12 @@ class GigeCamera::Device {
     publish();
   }
 
-  void act(uint32_t device_key, uint32_t group_key, uint32_t group_mask, uint16_t& status) {
+  void act(uint32_t device_key, uint32_t group_key, uint32_t group_mask, uint64_t when, uint16_t& status) {
     for (uint32_t i = 0; i < word(action_signal_count); ++i) {
       const uint32_t group = action_group + 16 * i;
       if (device_key != word(action_device_key) || group_key != word(group) || (group_mask & word(group + 4)) == 0)
         continue;
-      if (is_armed(source_action0 + i)) return expose();
+      if (is_armed(source_action0 + i)) return expose(when);
     }
     status = invalid_parameter;
     leave_unanswered();

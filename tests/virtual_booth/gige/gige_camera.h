@@ -27,6 +27,7 @@ struct GigeCameraOptions {
   bool counts_from_acquisition = true;      ///< block ids begin at 1 with each acquisition, as most cameras' do
   uint64_t tick_frequency = 1'000'000'000;  ///< of the device's clock
   double clock_error_ppm = 0;               ///< how much faster than this machine's it runs
+  bool shares_clock = false;                ///< it shows this machine's time, as all cameras that follow one PTP master
   bool offers_ptp = true;
   double largest_exposure_us = 1'000'000;
 };

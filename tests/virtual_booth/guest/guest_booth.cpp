@@ -2,6 +2,7 @@
 
 #include <cstdlib>
 #include <stdexcept>
+#include <utility>
 
 namespace booth {
 
@@ -13,6 +14,7 @@ GuestBooth::GuestBooth() {
                                      [this](const GpioPeer::Edge& edge) {
                                        if (edge.line != trigger_line || edge.level != 1) return;
                                        const std::lock_guard lock(mutex_);
+                                       if (at_trigger_) at_trigger_();
                                        for (UsbCameraPeer* camera : cameras_) camera->expose();
                                      });
 }
@@ -25,6 +27,11 @@ void GuestBooth::wire(UsbCameraPeer& camera) {
 void GuestBooth::unwire(UsbCameraPeer& camera) {
   const std::lock_guard lock(mutex_);
   cameras_.erase(&camera);
+}
+
+void GuestBooth::at_trigger(std::function<void()> action) {
+  const std::lock_guard lock(mutex_);
+  at_trigger_ = std::move(action);
 }
 
 GuestBooth& GuestBooth::instance() {

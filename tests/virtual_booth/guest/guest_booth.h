@@ -1,5 +1,6 @@
 #pragma once
 
+#include <functional>
 #include <memory>
 #include <mutex>
 #include <set>
@@ -25,6 +26,8 @@ class GuestBooth {
   GpioPeer& gpio() { return *gpio_; }
   void wire(UsbCameraPeer& camera);
   void unwire(UsbCameraPeer& camera);
+  /// Called at each pulse before the cameras expose, in a thread of the peer; an empty one: nothing is.
+  void at_trigger(std::function<void()> action);
 
   /// The booth of this program.
   static GuestBooth& instance();
@@ -32,6 +35,7 @@ class GuestBooth {
  private:
   std::mutex mutex_;
   std::set<UsbCameraPeer*> cameras_;  ///< guarded by mutex_
+  std::function<void()> at_trigger_;  ///< guarded by mutex_
   std::unique_ptr<GpioPeer> gpio_;
 };
 

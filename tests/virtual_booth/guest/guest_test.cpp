@@ -52,7 +52,7 @@ V4l2CameraSettings wired(const std::string& serial, int width, int height, V4l2F
           .format = format,
           .width = width,
           .height = height,
-          .warm_up_frames = 0,
+          .trigger = V4l2TriggerSource::line,
           .max_offset_ms = 20000};
 }
 
@@ -153,7 +153,7 @@ class RecordedBooth : public Guest {
 };
 
 TEST_F(RecordedBooth, EveryShotIsCompleteAndMatched) {
-  constexpr int shots = 40;
+  constexpr int shots = 200;
   arm_all(shots);
   Timestamp slowest = 0;
   for (int shot = 0; shot < shots && !HasFailure(); ++shot) {
@@ -249,7 +249,7 @@ std::optional<DriverUnderTest> streaming_camera(const Clock& clock) {
     return std::nullopt;
   }
   V4l2CameraSettings settings = wired(serial, 64, 48);
-  settings.warm_up_frames = 2;
+  settings.trigger = V4l2TriggerSource::stream;
   auto cameras = V4l2Source::open({{settings}}, clock);
   if (!cameras) {
     ADD_FAILURE() << cameras.error().message;
