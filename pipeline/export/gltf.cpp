@@ -96,6 +96,67 @@ size_t add_positions(Document& document, const Mesh& mesh, const SeamVertices& s
   return accessor;
 }
 
+/// An accessor of vectors that are zero but at `at`, ascending and not empty.
+template <class Index>
+size_t add_sparse_as(Document& document, size_t count, const std::vector<uint32_t>& at,
+                     const std::vector<Eigen::Vector3f>& values, int index_type) {
+  const std::vector<Index> indices(at.begin(), at.end());
+  const auto bytes = [](const auto& items) {
+    return std::span<const uint8_t>(reinterpret_cast<const uint8_t*>(items.data()), items.size() * sizeof(items[0]));
+  };
+  const size_t index_view = document.add_view(bytes(indices), 0), value_view = document.add_view(bytes(values), 0);
+  Eigen::AlignedBox3f box;
+  for (const Eigen::Vector3f& v : values) box.extend(v);
+  if (values.size() < count) box.extend(Eigen::Vector3f::Zero());
+  return document.append("accessors", {{"componentType", float_type},
+                                       {"count", count},
+                                       {"type", "VEC3"},
+                                       {"min", to_json(box.min())},
+                                       {"max", to_json(box.max())},
+                                       {"sparse",
+                                        {{"count", at.size()},
+                                         {"indices", {{"bufferView", index_view}, {"componentType", index_type}}},
+                                         {"values", {{"bufferView", value_view}}}}}});
+}
+
+size_t add_sparse(Document& document, size_t count, const std::vector<uint32_t>& at,
+                  const std::vector<Eigen::Vector3f>& values) {
+  return count <= size_t{std::numeric_limits<uint16_t>::max()} + 1
+             ? add_sparse_as<uint16_t>(document, count, at, values, short_type)
+             : add_sparse_as<uint32_t>(document, count, at, values, int_type);
+}
+
+/// A morph target's differences of positions and normals.
+Json add_morph(Document& document, const Avatar& avatar, const std::vector<Eigen::Vector3f>& normals,
+               const SeamVertices& split, const MorphTarget& morph) {
+  Mesh moved = avatar.mesh;
+  for (size_t i = 0; i < morph.vertices.size(); ++i) moved.positions[morph.vertices[i]] += morph.offsets[i];
+  const std::vector<Eigen::Vector3f> moved_normals = unit_normals(moved);
+  // A sparse accessor has an entry at least.
+  std::vector<uint32_t> position_at, normal_at;
+  std::vector<Eigen::Vector3f> position_by, normal_by;
+  for (uint32_t i = 0; i < split.mesh_vertex.size(); ++i) {
+    const uint32_t v = split.mesh_vertex[i];
+    const bool last = i + 1 == split.mesh_vertex.size();
+    const auto at = std::lower_bound(morph.vertices.begin(), morph.vertices.end(), v);
+    const bool moves = at != morph.vertices.end() && *at == v;
+    if (moves || (last && position_at.empty())) {
+      position_at.push_back(i);
+      position_by.push_back(moves ? morph.offsets[static_cast<size_t>(at - morph.vertices.begin())]
+                                  : Eigen::Vector3f(Eigen::Vector3f::Zero()));
+    }
+    const Eigen::Vector3f turned = moved_normals[v] - normals[v];
+    constexpr float visible = 1e-3F;
+    if (turned.norm() > visible || (last && normal_at.empty())) {
+      normal_at.push_back(i);
+      normal_by.push_back(turned);
+    }
+  }
+  const size_t count = split.mesh_vertex.size();
+  return {{"POSITION", add_sparse(document, count, position_at, position_by)},
+          {"NORMAL", add_sparse(document, count, normal_at, normal_by)}};
+}
+
 template <class Index>
 size_t add_indices_as(Document& document, const SeamVertices& split, int component_type) {
   std::vector<Index> indices;
@@ -218,10 +279,10 @@ std::vector<uint8_t> write_glb(const Avatar& avatar, std::span<const AnimationCl
   document.json["asset"] = {{"version", "2.0"}, {"generator", options.generator}};
   document.json["scene"] = 0;
 
-  Json attributes = {
-      {"POSITION", add_positions(document, avatar.mesh, split)},
-      {"NORMAL", document.add_accessor(spread(unit_normals(avatar.mesh), split), float_type, "VEC3", vertex_target)},
-      {"TEXCOORD_0", document.add_accessor(split.uv, float_type, "VEC2", vertex_target)}};
+  const std::vector<Eigen::Vector3f> normals = unit_normals(avatar.mesh);
+  Json attributes = {{"POSITION", add_positions(document, avatar.mesh, split)},
+                     {"NORMAL", document.add_accessor(spread(normals, split), float_type, "VEC3", vertex_target)},
+                     {"TEXCOORD_0", document.add_accessor(split.uv, float_type, "VEC2", vertex_target)}};
   Json body = {{"name", "avatar"}, {"mesh", 0}};
   Json roots = Json::array();
   if (const size_t joints = avatar.skeleton.joints.size(); joints > 0) {
@@ -235,10 +296,17 @@ std::vector<uint8_t> write_glb(const Avatar& avatar, std::span<const AnimationCl
     body["skin"] = add_skin(document, tables, root);
     for (const AnimationClip& clip : clips) add_animation(document, clip, root);
   }
-  const Json primitive = {{"attributes", attributes},
-                          {"indices", add_indices(document, split)},
-                          {"material", add_material(document, texture, options.texture_format)}};
-  document.append("meshes", {{"name", "avatar"}, {"primitives", Json::array({primitive})}});
+  Json primitive = {{"attributes", attributes},
+                    {"indices", add_indices(document, split)},
+                    {"material", add_material(document, texture, options.texture_format)}};
+  Json mesh = {{"name", "avatar"}};
+  for (const MorphTarget& morph : avatar.morphs) {
+    primitive["targets"].push_back(add_morph(document, avatar, normals, split, morph));
+    mesh["weights"].push_back(0);
+    mesh["extras"]["targetNames"].push_back(morph.name);  // where all importers look for them
+  }
+  mesh["primitives"] = Json::array({primitive});
+  document.append("meshes", mesh);
   roots.push_back(document.append("nodes", body));
   document.append("scenes", {{"nodes", roots}});
   return document.to_glb();

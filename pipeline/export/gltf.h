@@ -18,6 +18,7 @@ struct GltfOptions {
 
 /// The avatar as a self-contained glTF 2.0 binary (GLB): metres, Y up, facing +Z as glTF wants it. Vertices are split
 /// where the atlas has seams; the joints, their bind pose and the weights are the same as in write_collada.
+/// Morph targets are sparse; their names are in the mesh's extras.targetNames, as importers have agreed.
 /// @param clips    an animation each
 /// @param texture  the atlas, encoded; embedded as it is
 /// @pre check(avatar) holds

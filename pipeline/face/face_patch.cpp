@@ -113,7 +113,7 @@ FacePatch face_patch(const FittedHead& head, const FacePatchOptions& options) {
       if (place == none) {
         place = static_cast<uint32_t>(mesh->positions.size());
         mesh->positions.push_back(positions[t[k]]);
-        on_vertex(from_end[t[k]]);
+        on_vertex(t[k]);
       }
       renamed[k] = place;
     }
@@ -123,11 +123,14 @@ FacePatch face_patch(const FittedHead& head, const FacePatchOptions& options) {
   constexpr float nearly = 0.85F;
   std::vector<uint32_t> in_patch, in_core;
   for (const auto& t : triangles) {
-    add(&patch.mesh, &in_patch, t, [&](float rim) { patch.weight.push_back(smooth_step(rim / blend)); });
+    add(&patch.mesh, &in_patch, t, [&](uint32_t v) {
+      patch.head_vertex.push_back(v);
+      patch.weight.push_back(smooth_step(from_end[v] / blend));
+    });
     if (std::min({from_end[t[0]], from_end[t[1]], from_end[t[2]]}) < nearly * blend) continue;
-    add(&patch.core.mesh, &in_core, t, [&](float rim) {
+    add(&patch.core.mesh, &in_core, t, [&](uint32_t v) {
       constexpr float farthest_m = 0.05F;
-      patch.core.rim_m.push_back(std::min(rim, farthest_m));
+      patch.core.rim_m.push_back(std::min(from_end[v], farthest_m));
       patch.core.confidence.push_back(1);
     });
   }

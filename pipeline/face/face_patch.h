@@ -12,7 +12,8 @@ namespace booth {
 
 /// The part of a fitted head that takes the place of the hull's face.
 struct FacePatch {
-  Mesh mesh;                  ///< open, world frame, metres
+  Mesh mesh;                          ///< open, world frame, metres
+  std::vector<uint32_t> head_vertex;  ///< per vertex: which of the fitted head's it is
   std::vector<float> weight;  ///< per vertex, 0 … 1: falls to 0 towards the rim and around what covers the face
   /// Where the weight is nearly 1, as a scan: for merge_face.
   ScanMesh core;

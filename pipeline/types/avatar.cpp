@@ -1,5 +1,6 @@
 #include "pipeline/types/avatar.h"
 
+#include <algorithm>
 #include <cmath>
 #include <set>
 
@@ -62,8 +63,26 @@ Result<void> check(const Skin& skin, size_t vertices, size_t joints) {
   return {};
 }
 
+Result<void> check(const std::vector<MorphTarget>& morphs, size_t vertices) {
+  for (size_t m = 0; m < morphs.size(); ++m) {
+    const MorphTarget& morph = morphs[m];
+    const auto same_name = [&](const MorphTarget& other) { return other.name == morph.name; };
+    if (morph.name.empty() || std::any_of(morphs.begin(), morphs.begin() + static_cast<std::ptrdiff_t>(m), same_name))
+      return invalid("morphs: needs unique names, not \"" + morph.name + "\" again");
+    if (morph.offsets.size() != morph.vertices.size())
+      return invalid("morphs: " + morph.name + " needs an offset for every vertex");
+    for (size_t i = 0; i < morph.vertices.size(); ++i) {
+      if (morph.vertices[i] >= vertices || (i > 0 && morph.vertices[i] <= morph.vertices[i - 1]))
+        return invalid("morphs: " + morph.name + " needs ascending vertices of the mesh");
+      if (!morph.offsets[i].allFinite()) return invalid("morphs: " + morph.name + " has an offset that is not finite");
+    }
+  }
+  return {};
+}
+
 Result<void> check(const Avatar& avatar) {
   if (const auto checked = check(avatar.mesh); !checked) return checked;
+  if (const auto checked = check(avatar.morphs, avatar.mesh.positions.size()); !checked) return checked;
   if (avatar.atlas.image.channels != 3 || avatar.atlas.image.empty()) return invalid("atlas: needs an RGB image");
   if (avatar.atlas.uv.size() != avatar.mesh.triangles.size()) return invalid("atlas: needs a uv for every corner");
   for (size_t t = 0; t < avatar.atlas.uv.size(); ++t)

@@ -55,12 +55,23 @@ struct Skin {
 /// Weights in 0 … 1 with sum 1 (to 1e-4), largest first, joints in range and not repeated with weight.
 Result<void> check(const Skin& skin, size_t vertices, size_t joints);
 
+/// Another shape of the mesh at rest, such as a facial expression: how far vertices move at its full strength.
+struct MorphTarget {
+  std::string name;                      ///< ARKit's where it has one: "mouthSmileLeft"
+  std::vector<uint32_t> vertices;        ///< of the mesh, ascending
+  std::vector<Eigen::Vector3f> offsets;  ///< one entry for each of them, metres
+};
+
+/// Unique names, ascending vertices in range, an offset for each, all finite.
+Result<void> check(const std::vector<MorphTarget>& morphs, size_t vertices);
+
 /// What COLLADA and glTF are written from. Without joints it is an unrigged, textured mesh and `skin` is empty.
 struct Avatar {
   Mesh mesh;
   Atlas atlas;
   Skeleton skeleton;
   Skin skin;
+  std::vector<MorphTarget> morphs;
 };
 
 /// The checks of the parts, and that they fit together.

@@ -3,6 +3,7 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cstring>
 #include <nlohmann/json.hpp>
 #include <set>
@@ -162,6 +163,68 @@ TEST(Glb, OfAnUnriggedAvatarHasNoSkin) {
   EXPECT_FALSE(glb.json.contains("skins"));
   EXPECT_FALSE(glb.primitive()["attributes"].contains("JOINTS_0"));
   EXPECT_EQ(glb.json["scenes"][0]["nodes"].size(), 1U);
+}
+
+TEST(Glb, HoldsMorphTargetsByName) {
+  Avatar avatar = synthetic::make_avatar(synthetic::person());
+  avatar.morphs.push_back({"smile", {3, 7, 20}, {{0.001F, 0, 0}, {0, 0.002F, 0}, {0, 0, -0.003F}}});
+  avatar.morphs.push_back({"nothing", {}, {}});
+  ASSERT_TRUE(check(avatar).ok());
+  const Glb glb(write_glb(avatar, {}, {}, {}));
+  const Json& mesh = glb.json["meshes"][0];
+  EXPECT_EQ(mesh["extras"]["targetNames"], (Json{"smile", "nothing"}));
+  EXPECT_EQ(mesh["weights"], (Json{0, 0}));
+  ASSERT_EQ(glb.primitive()["targets"].size(), 2U);
+
+  const auto positions = glb.array<float>(glb.attribute("POSITION"));
+  const size_t count = positions.size() / 3;
+  const auto sparse = [&](size_t target, const char* name) {
+    const Json& accessor = glb.json["accessors"][glb.primitive()["targets"][target][name].get<size_t>()];
+    EXPECT_EQ(accessor["count"], count);
+    EXPECT_FALSE(accessor.contains("bufferView"));
+    const Bytes index_bytes = glb.view(accessor["sparse"]["indices"]["bufferView"]);
+    const Bytes value_bytes = glb.view(accessor["sparse"]["values"]["bufferView"]);
+    EXPECT_EQ(accessor["sparse"]["indices"]["componentType"], unsigned_short);
+    std::vector<uint16_t> indices(index_bytes.size() / 2);
+    std::vector<float> values(value_bytes.size() / 4);
+    std::memcpy(indices.data(), index_bytes.data(), index_bytes.size());
+    std::memcpy(values.data(), value_bytes.data(), value_bytes.size());
+    EXPECT_EQ(indices.size(), accessor["sparse"]["count"].get<size_t>());
+    EXPECT_TRUE(std::is_sorted(indices.begin(), indices.end()));
+    std::vector<Eigen::Vector3f> all(count, Eigen::Vector3f::Zero());
+    for (size_t i = 0; i < indices.size(); ++i) all[indices[i]] = {values[3 * i], values[3 * i + 1], values[3 * i + 2]};
+    return all;
+  };
+  // Every copy of a vertex that a seam has split moves with it, and nothing else does.
+  const auto moved = sparse(0, "POSITION");
+  for (size_t i = 0; i < count; ++i) {
+    const Eigen::Vector3f p(positions[3 * i], positions[3 * i + 1], positions[3 * i + 2]);
+    Eigen::Vector3f expected = Eigen::Vector3f::Zero();
+    for (size_t m = 0; m < 3; ++m)
+      if (p == avatar.mesh.positions[avatar.morphs[0].vertices[m]]) expected = avatar.morphs[0].offsets[m];
+    EXPECT_EQ(moved[i], expected) << i;
+  }
+  size_t turned = 0;
+  for (const Eigen::Vector3f& n : sparse(0, "NORMAL")) turned += n.isZero() ? 0 : 1;
+  EXPECT_GE(turned, 3U);
+  for (const Eigen::Vector3f& p : sparse(1, "POSITION")) EXPECT_TRUE(p.isZero());
+}
+
+TEST(MorphTargets, AreChecked) {
+  Avatar avatar = synthetic::make_avatar(synthetic::person());
+  const auto complaint = [&](std::vector<MorphTarget> morphs) {
+    avatar.morphs = std::move(morphs);
+    const auto checked = check(avatar);
+    return checked ? std::string() : checked.error().message;
+  };
+  const Eigen::Vector3f by(0, 0.001F, 0);
+  EXPECT_EQ(complaint({{"a", {1, 2}, {by, by}}, {"b", {}, {}}}), "");
+  EXPECT_NE(complaint({{"a", {}, {}}, {"a", {}, {}}}), "");
+  EXPECT_NE(complaint({{"", {}, {}}}), "");
+  EXPECT_NE(complaint({{"a", {2, 1}, {by, by}}}), "");
+  EXPECT_NE(complaint({{"a", {1}, {by, by}}}), "");
+  EXPECT_NE(complaint({{"a", {4000000}, {by}}}), "");
+  EXPECT_NE(complaint({{"a", {1}, {by / 0.0F}}}), "");
 }
 
 }  // namespace
