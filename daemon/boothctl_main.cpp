@@ -11,6 +11,7 @@
 #include <fstream>
 #include <iostream>
 #include <nlohmann/json.hpp>
+#include <numbers>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -20,7 +21,10 @@
 #include "daemon/api/client.h"
 #include "daemon/api/requests.h"
 #include "daemon/identifier.h"
+#include "daemon/offline_calibration.h"
+#include "pipeline/calibration/board_pdf.h"
 #include "pipeline/export/sha256.h"
+#include "pipeline/thread_pool.h"
 #include "pipeline/types/rig.h"
 #include "replay/durable_folder.h"
 
@@ -398,6 +402,45 @@ void Operator::watch() {
   }
 }
 
+struct BoardOptions {
+  std::string pdf, paper = "A3", dictionary;
+  std::optional<int> squares_x, squares_y;
+  std::optional<double> square_mm, marker_mm;
+};
+
+/// Writes a board to print. What is not given suits the paper.
+void write_board(const BoardOptions& options) {
+  const auto paper = std::find_if(paper_sizes.begin(), paper_sizes.end(),
+                                  [&](const auto& known) { return known.second == options.paper; });
+  CalibrationBoard board = board_for(paper->first);
+  board.squares_x = options.squares_x.value_or(board.squares_x);
+  board.squares_y = options.squares_y.value_or(board.squares_y);
+  if (options.square_mm) board.square_m = *options.square_mm / 1000;
+  board.marker_m = options.marker_mm ? *options.marker_mm / 1000 : 0.75 * board.square_m;
+  if (!options.dictionary.empty()) board.dictionary = options.dictionary;
+  const auto pdf = board_pdf(board, paper->first);
+  if (!pdf) throw Failure{exit_refused, pdf.error().message};
+  if (const auto written = write_file_atomically(options.pdf, std::string_view(*pdf)); !written)
+    throw Failure{exit_refused, written.error().message};
+  std::cout << "board = { squares_x = " << board.squares_x << ", squares_y = " << board.squares_y
+            << ", square_m = " << board.square_m << ", marker_m = " << board.marker_m << ", dictionary = \""
+            << board.dictionary << "\" }\n";
+}
+
+void calibrate_offline(const OfflineCalibrationOptions& options) {
+  ThreadPool pool;
+  const auto solved = calibrate_recordings(options, pool.work());
+  if (!solved) throw Failure{exit_refused, solved.error().message};
+  for (const DeviceQuality& device : solved->devices)
+    if (device.solved)
+      std::printf("%-12s %.3f px, %d views, position within %.2f mm, direction within %.4f deg\n", device.id.c_str(),
+                  device.rms_px, device.views, 1000 * device.pose.center_m,
+                  device.pose.rotation_rad * 180 / std::numbers::pi);
+  std::fflush(stdout);
+  for (const std::string& message : solved->messages) std::cout << "note: " << printable(message) << "\n";
+  std::cout << to_string(solved->verdict) << ": " << printable(solved->reason) << "\n";
+}
+
 }  // namespace
 }  // namespace booth
 
@@ -495,6 +538,36 @@ int main(int argc, char** argv) {
   trigger->add_subcommand("test", "fire once; tells which cameras answer, and when")->callback([&] {
     action = [](booth::Operator& op) { op.task("trigger.test", Json::object()); };
   });
+  std::function<void()> offline;  // of a command that needs no booth
+  booth::BoardOptions board_options;
+  auto* board = app.add_subcommand("board", "a calibration board to print, as a PDF true to scale");
+  board->add_option("--pdf", board_options.pdf, "the file")->required();
+  board->add_option("--paper", board_options.paper, "its size")
+      ->check(CLI::IsMember({"A4", "A3", "A2", "A1", "A0"}))
+      ->capture_default_str();
+  board->add_option("--squares-x", board_options.squares_x, "squares across; 8 when left out")
+      ->check(CLI::Range(3, 100));
+  board->add_option("--squares-y", board_options.squares_y, "squares along; 11 when left out")
+      ->check(CLI::Range(3, 100));
+  board->add_option("--square-mm", board_options.square_mm, "edge of a square; as fits the paper when left out")
+      ->check(CLI::Range(1.0, 1000.0));
+  board
+      ->add_option("--marker-mm", board_options.marker_mm, "edge of a marker; three quarters of a square when left out")
+      ->check(CLI::Range(1.0, 1000.0));
+  board->add_option("--dictionary", board_options.dictionary, "of the markers; DICT_5X5_250 when left out");
+  board->callback([&] { offline = [&] { booth::write_board(board_options); }; });
+  booth::OfflineCalibrationOptions calibration;
+  auto* calibrate = app.add_subcommand("calibrate", "solve the rig from recordings of a board");
+  calibrate->add_option("--recording", calibration.recordings, "a recording with a board shot; may be repeated")
+      ->required();
+  calibrate->add_option("--out", calibration.out, "the folder to make: rig.json, report.html, calibration.json")
+      ->required();
+  calibrate->add_option("--floor", calibration.floor_index,
+                        "index in the first board shot at which the board lies on the floor; otherwise the rig stays "
+                        "where the recording's lies");
+  calibrate->add_flag("--keep-unseen", calibration.keep_unseen,
+                      "cameras that never saw the board keep the recording's calibration");
+  calibrate->callback([&] { offline = [&] { booth::calibrate_offline(calibration); }; });
   app.add_subcommand("watch", "what happens, as it happens")->callback([&] {
     action = [](booth::Operator& op) { op.watch(); };
   });
@@ -508,6 +581,10 @@ int main(int argc, char** argv) {
     return app.exit(e) == 0 ? booth::exit_ok : booth::exit_usage;
   }
   try {
+    if (offline) {
+      offline();
+      return booth::exit_ok;
+    }
     booth::Operator op(options);
     action(op);
     return booth::exit_ok;

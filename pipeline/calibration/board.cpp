@@ -54,7 +54,7 @@ BoardPattern::BoardPattern(const CalibrationBoard& board)
   const auto dictionary = cv::aruco::getPredefinedDictionary(find_dictionary(board.dictionary).value());
   const int cells = dictionary->markerSize + 2 * border_cells;
   const double margin_m = (board.square_m - board.marker_m) / 2;
-  // OpenCV 4.6 numbers the markers by rows from the bottom.
+  // OpenCV 4.6 numbers the markers by rows from the top.
   for (int y = 0; y < board.squares_y; ++y) {
     for (int x = 0; x < board.squares_x; ++x) {
       if (black_square(x, y)) continue;
@@ -74,9 +74,9 @@ BoardPattern::BoardPattern(const CalibrationBoard& board)
   }
 }
 
-bool BoardPattern::black_square(int x, int y) const {
-  // The bottom left square is black where the number of rows is odd: OpenCV 4.6 makes the top left one so.
-  return (x + y) % 2 == (board_.squares_y - 1) % 2;
+bool BoardPattern::black_square(int x, int y) {
+  // OpenCV 4.6's boards begin with a black square at the top left.
+  return (x + y) % 2 == 0;
 }
 
 bool BoardPattern::white(double x, double y) const {
@@ -89,9 +89,9 @@ bool BoardPattern::white(double x, double y) const {
   const Eigen::Vector2d inside = (Eigen::Vector2d(x, y) - marker.corner) / board_.marker_m;
   if (inside.x() < 0 || inside.y() < 0 || inside.x() >= 1 || inside.y() >= 1) return true;
   const size_t cells = marker.white.size();
-  const size_t from_bottom = std::min(static_cast<size_t>(inside.y() * static_cast<double>(cells)), cells - 1);
+  const size_t from_top = std::min(static_cast<size_t>(inside.y() * static_cast<double>(cells)), cells - 1);
   const size_t from_left = std::min(static_cast<size_t>(inside.x() * static_cast<double>(cells)), cells - 1);
-  return marker.white[cells - 1 - from_bottom][from_left];
+  return marker.white[from_top][from_left];
 }
 
 Image draw_board(const CalibrationBoard& board, int square_px, int margin_px) {
@@ -100,7 +100,7 @@ Image draw_board(const CalibrationBoard& board, int square_px, int margin_px) {
   Image image(width + 2 * margin_px, height + 2 * margin_px, 1, 255);
   for (int y = 0; y < height; ++y)
     for (int x = 0; x < width; ++x)
-      if (!pattern.white((x + 0.5) / square_px * board.square_m, (height - y - 0.5) / square_px * board.square_m))
+      if (!pattern.white((x + 0.5) / square_px * board.square_m, (y + 0.5) / square_px * board.square_m))
         image.at(margin_px + x, margin_px + y) = 0;
   return image;
 }

@@ -11,15 +11,15 @@
 
 namespace booth {
 
-/// The board frame: metres, the printed face in the plane z = 0, seen from before it +x to the right, +y up and +z
-/// towards the onlooker; the origin is the outer corner at the bottom left. OpenCV 4.6's CharucoBoard has the same.
+/// The board frame: metres, the printed face in the plane z = 0, seen from before it +x to the right, +y down and +z
+/// away from the onlooker; the origin is the outer corner at the top left. OpenCV 4.6's CharucoBoard has the same.
 ///
 /// @return whether the board can be made and found: a ChArUco board of a dictionary that OpenCV has and that holds
 ///         enough markers, 3 … 100 squares each way, 0 < marker_m < square_m
 /// @error invalid_argument  names the field and its value
 Result<void> check(const CalibrationBoard& board);
 
-/// The corners between the squares, board frame: (squares_x − 1) × (squares_y − 1) of them, x fastest from the bottom
+/// The corners between the squares, board frame: (squares_x − 1) × (squares_y − 1) of them, x fastest from the top
 /// left. Their index is the corner's id everywhere.
 /// @pre check(board) holds
 std::vector<Eigen::Vector3d> board_corners(const CalibrationBoard& board);
@@ -38,14 +38,14 @@ class BoardPattern {
 
   struct Marker {
     int id = 0;
-    Eigen::Vector2d corner;  ///< its bottom left corner, metres in the board frame
+    Eigen::Vector2d corner;  ///< its top left corner, metres in the board frame
     std::vector<std::vector<bool>>
         white;  ///< cells by row from the top, by column from the left, black border included
   };
   const std::vector<Marker>& markers() const { return markers_; }
 
-  /// Whether a square is black; (0, 0) is at the bottom left.
-  bool black_square(int x, int y) const;
+  /// Whether a square is black; (0, 0) is at the top left.
+  static bool black_square(int x, int y);
 
  private:
   CalibrationBoard board_;
