@@ -100,6 +100,23 @@ TEST(CalibrationOfRecordings, FindsTheTrueRigFromTheBoardAlone) {
       EXPECT_LE(errors[i].rotation_deg, 0.02) << quality.id;
       EXPECT_LE(errors[i].focal, 0.001) << quality.id;
     }
+    // What the lines between the squares add to saddle points.
+    const auto from_saddles = solve_calibration(input, {.refine_corners = false}, pool.work());
+    ASSERT_TRUE(from_saddles) << from_saddles.error().message;
+    const auto worst = [](const std::vector<CameraError>& all) {
+      CameraError most;
+      for (const CameraError& error : all) {
+        most.center_m = std::max(most.center_m, error.center_m);
+        most.rotation_deg = std::max(most.rotation_deg, error.rotation_deg);
+        most.focal = std::max(most.focal, error.focal);
+      }
+      return most;
+    };
+    const CameraError ours = worst(errors), saddles = worst(errors_against(from_saddles->rig, *truth));
+    std::cout << "worst: centre " << 1000 * ours.center_m << " mm, rotation " << ours.rotation_deg << " deg, focal "
+              << 100 * ours.focal << " %; from saddle points alone " << 1000 * saddles.center_m << " mm, "
+              << saddles.rotation_deg << " deg, " << 100 * saddles.focal << " %\n";
+    EXPECT_LT(2 * ours.rotation_deg, saddles.rotation_deg);
     std::cout << "verdict " << to_string(solved->verdict) << ": " << solved->reason << "\n";
   }
 }
