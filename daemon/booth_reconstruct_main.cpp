@@ -19,6 +19,7 @@
 #include "daemon/face_model_loader.h"
 #include "daemon/reconstruct_job.h"
 #include "pipeline/thread_pool.h"
+#include "replay/recording.h"
 
 namespace booth {
 namespace {
@@ -128,6 +129,11 @@ int run(const Arguments& arguments) {
   ProgressBar bar;
   const bool draw = isatty(STDERR_FILENO) != 0 && arguments.progress_fd < 0;
   FaceModelLoader face_model(config.face.landmark_model);
+  // Beside the stages that come before it, so that it need not be waited for.
+  if (const auto recording = read_recording(arguments.recording);
+      recording && (options.face == FaceMode::passive ||
+                    (options.face == FaceMode::automatic && recording->find(ShotRole::gray_code) == nullptr)))
+    face_model.start();
   const auto made = reconstruct_recording(
       arguments.recording, arguments.avatar, options, [&] { return face_model.get(); }, config.files, work,
       [&](std::string_view stage, double fraction) {

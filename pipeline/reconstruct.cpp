@@ -2,10 +2,13 @@
 
 #include <algorithm>
 #include <array>
+#include <memory>
 #include <optional>
 #include <span>
 #include <utility>
 
+#include "pipeline/face/expressions.h"
+#include "pipeline/face/face_evidence.h"
 #include "pipeline/face/face_patch.h"
 #include "pipeline/face/field_fusion.h"
 #include "pipeline/geometry/solid_parts.h"
@@ -124,13 +127,20 @@ Result<SegmentedViews> segment_all(const CaptureFrames& capture, std::span<const
   return views;
 }
 
+/// What a face was fitted from and to.
+struct FittedFace {
+  std::shared_ptr<const NeutralHead> neutral;
+  FittedHead head;
+  FacePatch patch;  ///< which goes over into the hull
+};
+
 /// The face's own surface as a mesh.
 struct FaceSurface {
   FaceMode made = FaceMode::none;  ///< active: scanned; passive: fitted
   HeadRegion head;                 ///< of the hull
   ScanMesh scan;
-  Eigen::Vector3f eye;             ///< where it was seen from, world frame
-  std::optional<FacePatch> patch;  ///< of a fitted one, which goes over into the hull
+  Eigen::Vector3f eye;            ///< where it was seen from, world frame
+  std::optional<FittedFace> fit;  ///< of a passive one
 };
 
 Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Silhouette> silhouettes, const Field& hull,
@@ -154,18 +164,23 @@ Result<FaceSurface> fit_face(const VisualHull& hull, std::span<const Frame> fram
   if (!face_model) return Error{ErrorCode::not_found, "there is no model of landmarks"};
   const auto model = face_model();
   if (!model) return model.error();
-  const auto head = find_head(extract_surface(hull.field, work));
+  const Mesh surface = extract_surface(hull.field, work);
+  const auto head = find_head(surface);
   if (!head) return Error{ErrorCode::no_subject, "no head was found"};
   const auto controls = find_control_points(*hull.rig, frames, *head, *model->landmarks, options.control_points, work);
   if (!controls) return controls.error();
-  const auto fitted = fit_neutral_head(*model->neutral, *controls, hull.views, hull.field, options.head_fit, work);
+  auto fitted = fit_neutral_head(*model->neutral, *controls, hull.views, hull.field, options.head_fit, work);
   if (!fitted) return fitted.error();
   FacePatch patch = face_patch(*fitted);
   if (patch.core.mesh.triangles.empty())
     return Error{ErrorCode::no_subject, "hair or something else covers most of the face"};
+  const FaceEvidence evidence = weigh_face(*hull.rig, frames, *controls, surface, patch, hull.views, work);
+  if (work.stopped()) return Work::cancelled();
+  if (const auto objection = evidence.objection()) return Error{ErrorCode::no_subject, *objection};
   const Eigen::Vector3f eye = patch.eye;
   ScanMesh core = std::move(patch.core);
-  return FaceSurface{FaceMode::passive, *head, std::move(core), eye, std::move(patch)};
+  return FaceSurface{FaceMode::passive, *head, std::move(core), eye,
+                     FittedFace{model->neutral, std::move(*fitted), std::move(patch)}};
 }
 
 /// The face as asked for, or nothing and in the warnings why.
@@ -305,7 +320,7 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
   {
     const StageReport report("surface", work, progress);
     if (face && face->made == FaceMode::passive)
-      hull.field = blend_surface(hull.field, face->patch->mesh, face->patch->weight, face->eye, report.work());
+      hull.field = blend_surface(hull.field, face->fit->patch.mesh, face->fit->patch.weight, face->eye, report.work());
     else if (face && options.face_merge.method == FaceMergeMethod::sight)
       hull.field = fuse_scan(hull.field, face->head, face->scan, face->eye, report.work());
     if (face) keep_largest_part(hull.field, report.work());
@@ -313,6 +328,9 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
     avatar.mesh = make_surface(hull.field, face ? &*face : nullptr, options, report.work(), &warnings, &result.face);
     if (const size_t left = remove_self_intersections(&avatar.mesh, report.work()); left > 0)
       warnings.push_back("the surface passes through itself at " + std::to_string(left) + " edges");
+    if (result.face == FaceMode::passive)
+      avatar.morphs =
+          carry_expressions(*face->fit->neutral, face->fit->head, face->fit->patch, avatar.mesh, report.work());
     hull.field = {};
     if (work.stopped()) return Work::cancelled();
     if (avatar.mesh.triangles.empty()) return Error{ErrorCode::no_subject, "no surface is left after carving"};

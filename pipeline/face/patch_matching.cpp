@@ -39,7 +39,33 @@ std::optional<Patch> look_at(const PinholePicture& picture, const Eigen::Vector3
   return patch / length;
 }
 
+constexpr double most_slant = 0.5;  // cos 60°
+
 }  // namespace
+
+std::optional<double> patch_correlation(const PinholePicture& reference, std::span<const PinholePicture* const> others,
+                                        const Eigen::Vector3d& point, const Eigen::Vector3d& normal,
+                                        double half_size_m) {
+  const auto faces = [&](const PinholePicture& picture) {
+    return (picture.view.center() - point).normalized().dot(normal) > most_slant;
+  };
+  if (!faces(reference)) return std::nullopt;
+  const Eigen::Vector3d right = half_size_m * Eigen::Vector3d::UnitY().cross(normal).normalized();
+  const Eigen::Vector3d down = right.cross(normal);
+  const auto expected = look_at(reference, point, right, down);
+  if (!expected) return std::nullopt;
+  double sum = 0;
+  int seen = 0;
+  for (const PinholePicture* other : others) {
+    if (!faces(*other)) continue;
+    if (const auto patch = look_at(*other, point, right, down)) {
+      sum += static_cast<double>((*expected * *patch).sum());
+      ++seen;
+    }
+  }
+  if (seen == 0) return std::nullopt;
+  return sum / seen;
+}
 
 std::optional<PatchMatch> match_patch(const PinholePicture& reference, std::span<const PinholePicture* const> others,
                                       const Eigen::Vector3d& point, const Eigen::Vector3d& normal,
@@ -58,7 +84,6 @@ std::optional<PatchMatch> match_patch(const PinholePicture& reference, std::span
     const Eigen::Vector3d across = search.half_size_m * up.cross(facing).normalized();
     const Eigen::Vector3d down = across.cross(facing);
     std::vector<const PinholePicture*> seeing;
-    constexpr double most_slant = 0.5;  // cos 60°
     for (const PinholePicture* other : others)
       if ((other->view.center() - point).normalized().dot(facing) > most_slant) seeing.push_back(other);
     if (seeing.empty() || -sight.dot(facing) < most_slant) continue;

@@ -41,4 +41,13 @@ std::optional<PatchMatch> match_patch(const PinholePicture& reference, std::span
                                       const Eigen::Vector3d& point, const Eigen::Vector3d& normal,
                                       const PatchSearch& search = {});
 
+/// How alike the pictures are where a plane patch of surface would be: the mean correlation of the reference with each
+/// of the others that would see it at a slant of less than 60°.
+///
+/// @param normal  of the surface there, unit
+/// @return −1 … 1; nothing where fewer than two pictures show it or the patch has no contrast
+std::optional<double> patch_correlation(const PinholePicture& reference, std::span<const PinholePicture* const> others,
+                                        const Eigen::Vector3d& point, const Eigen::Vector3d& normal,
+                                        double half_size_m = 0.008);
+
 }  // namespace booth
