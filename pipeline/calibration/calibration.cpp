@@ -76,6 +76,21 @@ Result<void> check_view(const BoardView& view, const CalibrationDevice& device, 
   return {};
 }
 
+/// Corners in a row leave the board free to turn about it.
+bool spread_out(const BoardView& view, const std::vector<Eigen::Vector3d>& on_board, double square_m) {
+  Eigen::Vector2d mean = Eigen::Vector2d::Zero();
+  for (const TargetCorner& corner : view.corners) mean += on_board[static_cast<size_t>(corner.id)].head<2>();
+  mean /= static_cast<double>(view.corners.size());
+  Eigen::Matrix2d scatter = Eigen::Matrix2d::Zero();
+  for (const TargetCorner& corner : view.corners) {
+    const Eigen::Vector2d offset = on_board[static_cast<size_t>(corner.id)].head<2>() - mean;
+    scatter += offset * offset.transpose() / static_cast<double>(view.corners.size());
+  }
+  constexpr double least_squares = 0.4;  // standard deviation across; two full rows have 0.5
+  return Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d>(scatter).eigenvalues().minCoeff() >
+         std::pow(least_squares * square_m, 2);
+}
+
 Result<Task> prepare(const CalibrationInput& input) {
   const CalibrationBoard& board = input.board;
   constexpr int fewest_squares = 3, most_squares = 100;
@@ -91,7 +106,7 @@ Result<Task> prepare(const CalibrationInput& input) {
     if (device == input.devices.end())
       return Error{ErrorCode::invalid_argument, "a view is of " + view.camera + ", which is not to be calibrated"};
     if (const auto valid = check_view(view, *device, task.on_board.size()); !valid) return valid.error();
-    if (view.corners.size() < fewest_corners) continue;
+    if (view.corners.size() < fewest_corners || !spread_out(view, task.on_board, board.square_m)) continue;
     const int number = static_cast<int>(device - input.devices.begin());
     if (!ordered.emplace(std::pair{number, view.pose}, &view).second)
       return Error{ErrorCode::invalid_argument,

@@ -544,6 +544,47 @@ TEST(Calibration, RefusesViewsThatCannotBe) {
   EXPECT_THAT(solve_calibration(wrong).error().message, HasSubstr("two views of pose"));
 }
 
+TEST(Calibration, GoesOnWithoutViewsOfASingleRow) {
+  const Rig rig = ring(4);
+  auto input = input_of(rig, places_around(10, 0.5, 4), 0.05);
+  std::erase_if(input.views[0].corners, [](const TargetCorner& corner) { return corner.id / 7 != 2; });
+  const auto solved = solve_calibration(input);
+  ASSERT_TRUE(solved) << solved.error().message;
+  EXPECT_EQ(solved->rig.cameras.size(), rig.cameras.size());
+}
+
+TEST(ProjectorView, IsWhatWasDecodedAroundEachCorner) {
+  BoardView camera;
+  camera.camera = "camera";
+  camera.pose = 4;
+  const Eigen::Vector2d good(30.3, 25.6), dark(70.2, 25.1), edge(2.0, 2.0);
+  for (int id = 0; id < 3; ++id)
+    camera.corners.push_back({.id = id,
+                              .pixel = std::array{good, dark, edge}[static_cast<size_t>(id)],
+                              .covariance = 1e-4 * Eigen::Matrix2d::Identity()});
+  FloatImage position(100, 50, 2), sigma(100, 50, 2, 0.1F);
+  std::mt19937 random(1);
+  std::normal_distribution<double> noise(0, 0.1);
+  for (int y = 0; y < 50; ++y)
+    for (int x = 0; x < 100; ++x) {
+      const bool lit = x < 50;
+      position.at(x, y, 0) = lit ? static_cast<float>(200 + 0.8 * x - 0.1 * y + noise(random)) : std::nanf("");
+      position.at(x, y, 1) = lit ? static_cast<float>(100 + 0.05 * x + 0.7 * y + noise(random)) : std::nanf("");
+    }
+  position.at(31, 26, 0) += 40;  // a pixel that was decoded wrongly
+  const auto view = projector_view(camera, position, sigma, "projector");
+  ASSERT_TRUE(view);
+  EXPECT_EQ(view->camera, "projector");
+  EXPECT_EQ(view->pose, 4);
+  ASSERT_GE(view->corners.size(), 1U);
+  EXPECT_EQ(view->corners[0].id, 0);
+  const Eigen::Vector2d expected(200 + 0.8 * good.x() - 0.1 * good.y(), 100 + 0.05 * good.x() + 0.7 * good.y());
+  EXPECT_LT((view->corners[0].pixel - expected).norm(), 0.1);
+  EXPECT_LT(view->corners[0].covariance.trace(), 0.01);
+  for (const TargetCorner& corner : view->corners) EXPECT_NE(corner.id, 1) << "nothing was decoded there";
+  EXPECT_FALSE(projector_view(camera, position, FloatImage(100, 50, 1), "projector"));
+}
+
 TEST(Coverage, WantsTheNeediestCameraFirstAndIsContentInTheEnd) {
   const Rig rig = ring(4);
   const auto devices = calibration_devices(rig);
