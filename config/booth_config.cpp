@@ -323,8 +323,10 @@ void visit_reconstruct(Visitor& visitor, ReconstructionOptions& options) {
   for (const FaceMode mode : {FaceMode::automatic, FaceMode::active, FaceMode::passive, FaceMode::none})
     faces.emplace_back(to_string(mode), mode);
   visitor.choice("face", options.face, faces);
-  visitor.choice("face_merge", options.face_merge.method,
-                 Words<FaceMergeMethod>{{"sight", FaceMergeMethod::sight}, {"radial", FaceMergeMethod::radial}});
+  visitor.choice(
+      "face_merge", options.face_merge.method,
+      Words<FaceMergeMethod>{
+          {"sight", FaceMergeMethod::sight}, {"radial", FaceMergeMethod::radial}, {"sewing", FaceMergeMethod::sewing}});
   visitor.number("face_share", options.face_share, 0, 0.9);
   visitor.integer("triangles", options.decimation.triangles, 500, 1'000'000);
   visitor.integer("atlas_size", options.atlas.size, 256, 8192);

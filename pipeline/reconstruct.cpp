@@ -10,6 +10,7 @@
 #include "pipeline/face/expressions.h"
 #include "pipeline/face/face_evidence.h"
 #include "pipeline/face/face_patch.h"
+#include "pipeline/face/face_sewing.h"
 #include "pipeline/face/field_fusion.h"
 #include "pipeline/geometry/solid_parts.h"
 #include "pipeline/image/develop.h"
@@ -208,11 +209,25 @@ std::optional<FaceSurface> make_face(const CaptureFrames& capture, const VisualH
   return std::nullopt;
 }
 
+/// Whether the face is cut out of the hull's mesh and another sewn in. Scans are too ragged for that.
+bool is_sewn(const FaceSurface& face, const ReconstructionOptions& options) {
+  return face.made == FaceMode::passive && options.face_merge.method == FaceMergeMethod::sewing;
+}
+
 /// The closed surface within its budget of triangles, with the face's scan where there is one that meets it.
 Mesh make_surface(const Field& field, const FaceSurface* face, const ReconstructionOptions& options, const Work& work,
                   std::vector<std::string>* warnings, FaceMode* made) {
   const Mesh mesh = smooth_hc(extract_surface(field, work), options.smoothing, work);
   if (face == nullptr) return decimate(mesh, options.decimation, work);
+  if (is_sewn(*face, options)) {
+    auto sewn = sew_face(mesh, face->fit->patch);
+    if (sewn) {
+      *made = face->made;
+      return decimate(sewn->mesh, sewn->face, options.face_share, options.decimation, work);
+    }
+    warnings->push_back("the face is the hull's own: " + sewn.error().message);
+    return decimate(mesh, options.decimation, work);
+  }
   auto merged = merge_face(mesh, face->head, face->scan, face->eye, options.face_merge, work);
   if (!merged) {
     warnings->push_back("the face is the hull's own: " + merged.error().message);
@@ -319,9 +334,11 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
   Avatar& avatar = result.avatar;
   {
     const StageReport report("surface", work, progress);
-    if (face && face->made == FaceMode::passive)
-      hull.field = blend_surface(hull.field, face->fit->patch.mesh, face->fit->patch.weight, face->eye, report.work());
-    else if (face && options.face_merge.method == FaceMergeMethod::sight)
+    if (face && face->made == FaceMode::passive) {
+      if (!is_sewn(*face, options))
+        hull.field =
+            blend_surface(hull.field, face->fit->patch.mesh, face->fit->patch.weight, face->eye, report.work());
+    } else if (face && options.face_merge.method != FaceMergeMethod::radial)
       hull.field = fuse_scan(hull.field, face->head, face->scan, face->eye, report.work());
     if (face) keep_largest_part(hull.field, report.work());
     remove_small_handles(hull.field, options.handles, report.work());

@@ -15,6 +15,7 @@ namespace booth {
 enum class FaceMergeMethod {
   sight,   ///< along the rays from where the scan was seen; the surface around it bends to meet it
   radial,  ///< the paper's: along the rays from the head's barycentre; the step is smoothed afterwards
+  sewing,  ///< the paper's for a fitted face: cut out and sewn in (face_sewing.h); a scan goes by sight
 };
 
 struct FaceMergeOptions {
@@ -39,9 +40,10 @@ struct FaceMerge {
 /// continues the scan's displacement smoothly (least bending) and fades within the bridge.
 ///
 /// Radial: vertices of the subdivided region (by the butterfly scheme) go along the rays from the head's barycentre to
-/// the outermost surface there. Between the MOVED and the STUCK shore, half a bridge to each side of where the scan ends,
-/// each vertex takes the mean of both positions weighted by its distances d_M and d_S to the shores along shortest
-/// vertex paths. Where a ray meets the scan more than once (under the nose, at nostrils and ears) detail is lost.
+/// the outermost surface there. Between the MOVED and the STUCK shore, half a bridge to each side of where the scan
+/// ends, each vertex takes the mean of both positions weighted by its distances d_M and d_S to the shores along
+/// shortest vertex paths. Where a ray meets the scan more than once (under the nose, at nostrils and ears) detail is
+/// lost.
 ///
 /// @param hull  closed, world frame, its facets finer than the bridge
 /// @param eye   world frame: where the scan was seen from (the projector)
