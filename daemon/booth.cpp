@@ -17,6 +17,7 @@
 #include <utility>
 
 #include "daemon/identifier.h"
+#include "daemon/projector_delay.h"
 #include "pipeline/types/rig.h"
 #include "replay/durable_folder.h"
 
@@ -177,21 +178,23 @@ void Booth::open_capture(const Devices& devices) {
     events_.publish(CameraChanged{camera.id, camera.state, camera.message});
   });
   previews_ = std::make_unique<PreviewBoard>(*cameras_, metrics_, clock_, events_.wakeup());
-  session_ = std::make_unique<CaptureSession>(CaptureParts{.config = options_.config.capture,
-                                                           .recordings = options_.config.booth.recordings(),
-                                                           .source = devices.source,
-                                                           .trigger = devices.trigger,
-                                                           .projector = devices.projector,
-                                                           .rig = [this] { return this->rig(); },
-                                                           .cameras = *cameras_,
-                                                           .tasks = tasks_,
-                                                           .backgrounds = *backgrounds_,
-                                                           .jobs = *jobs_,
-                                                           .events = events_,
-                                                           .metrics = metrics_,
-                                                           .clock = clock_,
-                                                           .set_state = [this](BoothState state) { set_state(state); },
-                                                           .check_disk = [this] { return check_disk(); }});
+  session_ = std::make_unique<CaptureSession>(
+      CaptureParts{.config = options_.config.capture,
+                   .recordings = options_.config.booth.recordings(),
+                   .projector_delay = projector_delay_file(options_.config.booth.state_directory),
+                   .source = devices.source,
+                   .trigger = devices.trigger,
+                   .projector = devices.projector,
+                   .rig = [this] { return this->rig(); },
+                   .cameras = *cameras_,
+                   .tasks = tasks_,
+                   .backgrounds = *backgrounds_,
+                   .jobs = *jobs_,
+                   .events = events_,
+                   .metrics = metrics_,
+                   .clock = clock_,
+                   .set_state = [this](BoothState state) { set_state(state); },
+                   .check_disk = [this] { return check_disk(); }});
   constexpr size_t most_discoveries = 4;
   discoverer_ = std::make_unique<SerialExecutor>("discover", most_discoveries);
 }
@@ -373,6 +376,11 @@ Result<std::string> Booth::learn_background(std::optional<int> frames) {
 Result<std::string> Booth::test_trigger() {
   if (session_ == nullptr) return Error{ErrorCode::not_ready, "the booth has no devices: " + device_fault_};
   return session_->test_trigger();
+}
+
+Result<std::string> Booth::calibrate_projector() {
+  if (session_ == nullptr) return Error{ErrorCode::not_ready, "the booth has no devices: " + device_fault_};
+  return session_->calibrate_projector();
 }
 
 Result<void> Booth::start_preview(const std::string& camera, PreviewSettings settings) {

@@ -125,6 +125,9 @@ class Booth {
   Result<std::string> learn_background(std::optional<int> frames);
   /// Fires once and tells which cameras answer, and when. @error busy, not_ready, device_lost
   Result<std::string> test_trigger();
+  /// Measures the delay from a flip of the projector to the subject, by a face camera, and keeps it. The scene must
+  /// hold still. @error busy, not_ready; unsupported  the booth has no projector on a display output
+  Result<std::string> calibrate_projector();
 
   /// @param settings  its rotation is the camera's own. @error not_found  no such camera
   Result<void> start_preview(const std::string& camera, PreviewSettings settings);

@@ -568,6 +568,12 @@ int main(int argc, char** argv) {
   calibrate->add_flag("--keep-unseen", calibration.keep_unseen,
                       "cameras that never saw the board keep the recording's calibration");
   calibrate->callback([&] { offline = [&] { booth::calibrate_offline(calibration); }; });
+  auto* projector = app.add_subcommand("projector", "what lights the face with patterns");
+  projector->require_subcommand(1);
+  projector
+      ->add_subcommand("calibrate",
+                       "measure its delay by a face camera, with nothing moving in front of it, and keep it")
+      ->callback([&] { action = [](booth::Operator& op) { op.task("projector.calibrate", Json::object()); }; });
   app.add_subcommand("watch", "what happens, as it happens")->callback([&] {
     action = [](booth::Operator& op) { op.watch(); };
   });

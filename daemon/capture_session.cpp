@@ -10,7 +10,10 @@
 #include <map>
 #include <utility>
 
+#include "daemon/collected_camera.h"
 #include "daemon/identifier.h"
+#include "daemon/projector_delay.h"
+#include "drivers/display/delay_calibration.h"
 #include "replay/durable_folder.h"
 #include "replay/recording_file.h"
 
@@ -78,6 +81,8 @@ std::optional<std::string> CaptureSession::occupation() const {
   if (!operation_) return std::nullopt;
   if (std::holds_alternative<BackgroundRequest>(operation_->request)) return "the background is being learned";
   if (std::holds_alternative<TriggerTestRequest>(operation_->request)) return "the trigger is being tested";
+  if (std::holds_alternative<ProjectorCalibrationRequest>(operation_->request))
+    return "the projector is being calibrated";
   return "capture " + operation_->id + " is under way";
 }
 
@@ -99,6 +104,11 @@ Result<std::string> CaptureSession::learn_background(const BackgroundRequest& re
 
 Result<std::string> CaptureSession::test_trigger() {
   return begin_task(TaskKind::trigger_test, TriggerTestRequest{}, BoothState::calibrating);
+}
+
+Result<std::string> CaptureSession::calibrate_projector() {
+  if (!projector_) return Error{ErrorCode::unsupported, "this booth has no projector"};
+  return begin_task(TaskKind::projector_calibration, ProjectorCalibrationRequest{}, BoothState::calibrating);
 }
 
 Result<std::string> CaptureSession::begin_task(TaskKind kind, const Request& request, BoothState state) {
@@ -634,6 +644,42 @@ Result<TaskResult> CaptureSession::work(const std::string&, const TriggerTestReq
   const auto shot = fire_and_collect(collector, ShotRole::body, cancelled);
   if (!shot) return shot.error();
   return TaskResult(TriggerTested{shot->offsets_us, shot->missing, shot->skew_us, shot->remarks});
+}
+
+Result<TaskResult> CaptureSession::work(const std::string&, const ProjectorCalibrationRequest&,
+                                        const std::stop_token& cancelled) {
+  const auto opened = projector_->get();
+  if (!opened) return Error{ErrorCode::device_lost, "the projector cannot be used: " + opened.error().message};
+  auto* const projector = dynamic_cast<FlippingProjector*>(*opened);
+  if (projector == nullptr)
+    return Error{ErrorCode::unsupported,
+                 "the projector does not tell when a pattern goes out: only one on a display output has a delay that "
+                 "can be measured"};
+  const auto trigger = trigger_.get();
+  if (!trigger) return Error{ErrorCode::device_lost, "the trigger cannot be used: " + trigger.error().message};
+  const std::vector<std::string> faces = parts_.cameras.ids(CameraRole::face);
+  if (faces.empty()) return Error{ErrorCode::not_ready, "the booth has no face camera that could see the projector"};
+
+  constexpr DelayCalibrationOptions calibration{.max_delay_ms = 300, .repeats = 3};  // some ten seconds
+  // The first that sees it will do.
+  Result<DelayCalibration> measured = Error{};
+  std::string camera;
+  for (const std::string& id : faces) {
+    pulse_.beat();
+    camera = id;
+    CollectedCamera looking(parts_.cameras, id, arm_patience, milliseconds(parts_.config.max_skew_ms), parts_.clock,
+                            cancelled);
+    measured = calibrate_delay(*projector, *trigger, looking, parts_.clock, calibration, [this] { pulse_.beat(); });
+    if (cancelled.stop_requested()) return was_cancelled();
+    if (measured) break;
+  }
+  if (!measured) return measured.error();
+  if (const auto written = write_projector_delay(parts_.projector_delay, {projector->info().id, measured->delay_us,
+                                                                          iso8601(std::chrono::system_clock::now())});
+      !written)
+    return written.error();
+  projector_->reopen();
+  return TaskResult(ProjectorCalibrated{measured->delay_us, measured->measured_us, measured->contrast, camera});
 }
 
 }  // namespace booth

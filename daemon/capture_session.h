@@ -46,10 +46,14 @@ struct BackgroundRequest {
 /// One trigger is to be fired, to see which cameras answer and when.
 struct TriggerTestRequest {};
 
+/// The projector's delay is to be measured.
+struct ProjectorCalibrationRequest {};
+
 /// What a capture works with; all of it outlives the session.
 struct CaptureParts {
   CaptureConfig config;
   std::filesystem::path recordings;
+  std::filesystem::path projector_delay;  ///< the file that keeps what was measured
   std::shared_ptr<DeviceSource> source;
   std::string trigger;                              ///< its driver's name
   std::optional<std::string> projector;             ///< its id, where the booth has one
@@ -79,6 +83,8 @@ class CaptureSession {
   Result<std::string> learn_background(const BackgroundRequest& request);
   /// Likewise. @error busy
   Result<std::string> test_trigger();
+  /// Likewise. @error busy; unsupported  there is no projector whose flips are known
+  Result<std::string> calibrate_projector();
   /// @error invalid_state  it is over, or can no longer be stopped; not_found
   Result<void> cancel(const std::string& id);
   /// Of a capture under way nothing will remain, whatever it has done so far. Others: nothing happens.
@@ -98,7 +104,7 @@ class CaptureSession {
   void drain(std::chrono::milliseconds patience);
 
  private:
-  using Request = std::variant<CaptureRequest, BackgroundRequest, TriggerTestRequest>;
+  using Request = std::variant<CaptureRequest, BackgroundRequest, TriggerTestRequest, ProjectorCalibrationRequest>;
   /// The one thing that is under way.
   struct Operation {
     std::string id;  ///< the capture's, or the task's
@@ -134,6 +140,8 @@ class CaptureSession {
   // The tasks.
   Result<TaskResult> work(const std::string& task, const BackgroundRequest& request, const std::stop_token& cancelled);
   Result<TaskResult> work(const std::string& task, const TriggerTestRequest& request, const std::stop_token& cancelled);
+  Result<TaskResult> work(const std::string& task, const ProjectorCalibrationRequest& request,
+                          const std::stop_token& cancelled);
   using Views = std::map<std::string, std::vector<CoarseView>>;  ///< by camera, in their order
   Result<Views> take_background(const std::string& task, int frames, RecordingWriter& writer,
                                 const std::stop_token& cancelled);

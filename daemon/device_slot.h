@@ -57,6 +57,11 @@ class DeviceSlot {
     next_try_ = now + patience_;
     patience_ = std::min(2 * patience_, most_patience);
   }
+  /// Closes it; the next get() opens it with what is configured then.
+  void reopen() {
+    device_.reset();
+    next_try_ = {};
+  }
   /// It is gone, or misbehaves: the next get() opens it anew.
   void lose(const Error& error) {
     device_.reset();

@@ -9,6 +9,7 @@
 #include "daemon/booth.h"
 #include "daemon/combined_source.h"
 #include "daemon/identifier.h"
+#include "daemon/projector_delay.h"
 #include "drivers/aravis/aravis_source.h"
 #include "drivers/display/display_projector.h"
 #include "drivers/gpio/gpio_devices.h"
@@ -105,13 +106,18 @@ std::optional<std::string> projector_id(const ProjectorConfig& config, const Dri
   return std::nullopt;
 }
 
-CombinedParts::OpenProjector projector_of(const ProjectorConfig& config, const Drivers& drivers, const Clock& clock) {
+CombinedParts::OpenProjector projector_of(const ProjectorConfig& config, const std::filesystem::path& delay_file,
+                                          const Drivers& drivers, const Clock& clock) {
   switch (config.driver) {
     case ProjectorDriver::replay: return [replay = drivers.replay] { return replay->open_projector(); };
     case ProjectorDriver::gpio: return [gpio = config.gpio, &clock] { return open_gpio_projector(gpio, clock); };
     case ProjectorDriver::display:
-      return [display = config.display, &clock]() -> Result<std::unique_ptr<Projector>> {
-        auto opened = open_display_projector(display, clock);
+      return [display = config.display, delay_file, &clock]() -> Result<std::unique_ptr<Projector>> {
+        DisplaySettings settings = display;
+        // What was measured holds, not what was guessed.
+        if (const auto delay = read_projector_delay(delay_file); delay && delay->projector == settings.id)
+          settings.delay_us = delay->delay_us;
+        auto opened = open_display_projector(settings, clock);
         if (!opened) return opened.error();
         return std::unique_ptr<Projector>(*std::move(opened));
       };
@@ -158,7 +164,7 @@ Result<Devices> open_devices(const BoothConfig& config, const Clock& clock) {
     replayed |= parts.cameras[camera.id] == drivers->replay;
   }
   parts.trigger = trigger_of(config.trigger, *drivers, clock);
-  parts.projector = projector_of(config.projector, *drivers, clock);
+  parts.projector = projector_of(config.projector, projector_delay_file(config.booth.state_directory), *drivers, clock);
   // Cameras that are played back do not see what really happens.
   if (replayed && config.trigger.driver != TriggerDriver::replay) parts.trigger_follower = drivers->replay;
   if (replayed && config.projector.driver != ProjectorDriver::replay) parts.projector_follower = drivers->replay;

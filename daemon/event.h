@@ -21,7 +21,14 @@ std::string_view to_string(BoothState state);
 enum class DeviceState { online, offline, degraded };
 std::string_view to_string(DeviceState state);
 
-enum class TaskKind { discover, background, trigger_test, calibration_capture, calibration_solve };
+enum class TaskKind {
+  discover,
+  background,
+  trigger_test,
+  projector_calibration,
+  calibration_capture,
+  calibration_solve
+};
 std::string_view to_string(TaskKind kind);
 
 enum class TaskState { running, done, failed };
@@ -110,7 +117,14 @@ struct TriggerTested {
   double skew_us = 0;
   std::vector<std::string> warnings;  ///< sentences
 };
-using TaskResult = std::variant<std::monostate, CamerasDiscovered, BackgroundLearned, TriggerTested>;
+struct ProjectorCalibrated {
+  int delay_us = 0;     ///< in force from now on
+  int measured_us = 0;  ///< the shortest that was enough
+  double contrast = 0;  ///< of white and black, of 255
+  std::string camera;   ///< that looked
+};
+using TaskResult =
+    std::variant<std::monostate, CamerasDiscovered, BackgroundLearned, TriggerTested, ProjectorCalibrated>;
 struct TaskChanged {
   std::string task;
   TaskKind kind;

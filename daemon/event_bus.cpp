@@ -34,6 +34,7 @@ std::string_view to_string(TaskKind kind) {
     case TaskKind::discover: return "discover";
     case TaskKind::background: return "background";
     case TaskKind::trigger_test: return "trigger_test";
+    case TaskKind::projector_calibration: return "projector_calibration";
     case TaskKind::calibration_capture: return "calibration_capture";
     case TaskKind::calibration_solve: return "calibration_solve";
   }

@@ -111,6 +111,9 @@ std::optional<Reply> Dispatcher::dispatch(Method method, const Json& params, con
     case Method::preview_stop: respond(stop_preview(params)); break;
     case Method::background_learn: respond(learn_background(params)); break;
     case Method::trigger_test: respond(no_params([&] { return task_answer(booth_.test_trigger()); })); break;
+    case Method::projector_calibrate:
+      respond(no_params([&] { return task_answer(booth_.calibrate_projector()); }));
+      break;
     case Method::calibration_capture:
     case Method::calibration_solve:
     case Method::calibration_apply:

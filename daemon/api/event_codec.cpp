@@ -87,6 +87,12 @@ Json result_json(const TriggerTested& tested) {
           {"skew_us", tested.skew_us},
           {"warnings", tested.warnings}};
 }
+Json result_json(const ProjectorCalibrated& calibrated) {
+  return {{"delay_us", calibrated.delay_us},
+          {"measured_us", calibrated.measured_us},
+          {"contrast", calibrated.contrast},
+          {"camera", calibrated.camera}};
+}
 Topic topic_of(const TaskChanged& e) {
   return {"task",
           {{"task", e.task},

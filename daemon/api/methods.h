@@ -17,6 +17,7 @@ enum class Method {
   preview_stop,
   background_learn,
   trigger_test,
+  projector_calibrate,
   calibration_capture,
   calibration_solve,
   calibration_apply,
@@ -39,7 +40,7 @@ struct MethodEntry {
   bool changes;  ///< changes or starts something, and so takes a `key`
 };
 
-inline constexpr std::array<MethodEntry, 23> methods{{
+inline constexpr std::array<MethodEntry, 24> methods{{
     {Method::system_describe, "system.describe", false},
     {Method::system_status, "system.status", false},
     {Method::system_metrics, "system.metrics", false},
@@ -49,6 +50,7 @@ inline constexpr std::array<MethodEntry, 23> methods{{
     {Method::preview_stop, "preview.stop", true},
     {Method::background_learn, "background.learn", true},
     {Method::trigger_test, "trigger.test", true},
+    {Method::projector_calibrate, "projector.calibrate", true},
     {Method::calibration_capture, "calibration.capture", true},
     {Method::calibration_solve, "calibration.solve", true},
     {Method::calibration_apply, "calibration.apply", true},

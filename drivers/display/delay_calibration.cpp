@@ -37,8 +37,8 @@ double mean(const Image& image, const std::vector<size_t>& samples) {
 class Calibration {
  public:
   Calibration(FlippingProjector& projector, Trigger* trigger, Camera& camera, const Clock& clock,
-              const DelayCalibrationOptions& options)
-      : projector_(projector), trigger_(trigger), camera_(camera), clock_(clock), options_(options) {}
+              const DelayCalibrationOptions& options, const std::function<void()>& alive)
+      : projector_(projector), trigger_(trigger), camera_(camera), clock_(clock), options_(options), alive_(alive) {}
 
   ~Calibration() {
     projector_.dark();
@@ -92,6 +92,7 @@ class Calibration {
 
   /// A picture whose exposure begins `delay_us` or a little more after the flip to that pattern.
   Result<Picture> picture(int pattern, int delay_us) {
+    if (alive_) alive_();
     if (auto armed = camera_.arm({.role = ShotRole::gray_code}, 1); !armed) return armed.error();
     const auto flipped = projector_.flip(pattern);
     if (!flipped) return flipped.error();
@@ -165,6 +166,7 @@ class Calibration {
   Camera& camera_;
   const Clock& clock_;
   const DelayCalibrationOptions& options_;
+  const std::function<void()>& alive_;
   Reference reference_;
   int pictures_ = 0;
 };
@@ -184,10 +186,11 @@ Result<void> check(const DelayCalibrationOptions& options) {
 }  // namespace
 
 Result<DelayCalibration> calibrate_delay(FlippingProjector& projector, Trigger* trigger, Camera& camera,
-                                         const Clock& clock, const DelayCalibrationOptions& options) {
+                                         const Clock& clock, const DelayCalibrationOptions& options,
+                                         const std::function<void()>& alive) {
   if (auto checked = check(options); !checked) return checked.error();
   if (trigger != nullptr) trigger->prepare(ShotRole::gray_code);
-  return Calibration(projector, trigger, camera, clock, options).run();
+  return Calibration(projector, trigger, camera, clock, options, alive).run();
 }
 
 }  // namespace booth

@@ -31,11 +31,13 @@ struct DelayCalibration {
 ///
 /// @param trigger  of the camera; nullptr: the camera goes by note_trigger alone
 /// @param camera   not armed; it is stopped at the end. Best with the exposure of Gray-code shots
+/// @param alive    called between pictures; may be empty
 /// @return the projector is dark again, also after an error
 /// @error not_ready  the camera does not see the projector's light, or no delay up to max_delay_ms was long enough;
 ///        invalid_argument  an option; what projector, trigger and camera return
 /// Source: Sandia National Laboratories, OpenCSP, SOFAST: closing in on the delay until patterns mix.
 Result<DelayCalibration> calibrate_delay(FlippingProjector& projector, Trigger* trigger, Camera& camera,
-                                         const Clock& clock, const DelayCalibrationOptions& options = {});
+                                         const Clock& clock, const DelayCalibrationOptions& options = {},
+                                         const std::function<void()>& alive = {});
 
 }  // namespace booth

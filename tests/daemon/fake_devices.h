@@ -14,6 +14,7 @@
 
 #include "drivers/clock.h"
 #include "drivers/device_source.h"
+#include "drivers/display/display_projector.h"
 
 namespace booth::test {
 
@@ -112,6 +113,11 @@ class FakeDevices final : public DeviceSource, public std::enable_shared_from_th
     const std::lock_guard lock(mutex_);
     broken_at_ = pattern;
   }
+  /// Patterns that are flipped reach the subject that much later: white makes pictures bright, all others dark.
+  void set_latency(Timestamp latency) {
+    const std::lock_guard lock(mutex_);
+    latency_ = latency;
+  }
   void break_trigger(std::optional<Error> error) {
     const std::lock_guard lock(mutex_);
     trigger_error_ = std::move(error);
@@ -159,7 +165,9 @@ class FakeDevices final : public DeviceSource, public std::enable_shared_from_th
         channel.plugged = false;
         continue;
       }
-      const int pattern = shown_.empty() || shown_.back() < 0 ? 100 : shown_.back();
+      const int pattern = latency_                              ? light_at(now - *latency_)
+                          : shown_.empty() || shown_.back() < 0 ? 100
+                                                                : shown_.back();
       Result<Frame> made =
           frame(channel, trigger + answer.index_off, now + answer.offset, answer.grey.value_or(pattern));
       if (answer.kind == FakeAnswer::Kind::corrupt) made = Error{ErrorCode::invalid_file, id + ": packets are missing"};
@@ -169,8 +177,19 @@ class FakeDevices final : public DeviceSource, public std::enable_shared_from_th
     return now;
   }
 
+  /// What a camera sees of the pattern that was flipped to by then.
+  int light_at(Timestamp when) const {
+    constexpr int white = 6, bright = 200, dim = 10;
+    int pattern = -1;
+    for (const auto& [flipped, index] : flips_)
+      if (flipped <= when) pattern = index;
+    return pattern == white ? bright : dim;
+  }
+
   const Clock& clock_;
   std::mutex mutex_;
+  std::vector<std::pair<Timestamp, int>> flips_;
+  std::optional<Timestamp> latency_;
   std::condition_variable arrived_;
   std::map<std::string, Channel> channels_;
   Script script_;
@@ -259,7 +278,7 @@ class FakeTrigger final : public Trigger {
   const std::string name_ = "fake";
 };
 
-class FakeProjector final : public Projector {
+class FakeProjector final : public FlippingProjector {
  public:
   explicit FakeProjector(std::shared_ptr<FakeDevices> devices) : devices_(std::move(devices)) {}
   ~FakeProjector() override { dark(); }
@@ -270,6 +289,14 @@ class FakeProjector final : public Projector {
     devices_->shown_.push_back(index);
     return {};
   }
+  Result<Timestamp> flip(int index) override {
+    if (const auto shown = show(index); !shown) return shown.error();
+    const std::lock_guard lock(devices_->mutex_);
+    const Timestamp now = devices_->clock_.now();
+    devices_->flips_.emplace_back(now, index);
+    return now;
+  }
+  Timestamp refresh_ns() const override { return milliseconds(16); }
   void dark() noexcept override {
     const std::lock_guard lock(devices_->mutex_);
     devices_->shown_.push_back(-1);

@@ -6,6 +6,7 @@
 #include <set>
 #include <thread>
 
+#include "daemon/projector_delay.h"
 #include "pipeline/image/codec.h"
 #include "replay/recording_file.h"
 #include "replay/replay_devices.h"
@@ -465,6 +466,35 @@ TEST_F(Live, TheTriggerTestTellsWhoAnswersAndWhen) {
   EXPECT_EQ(end.fields["result"]["offsets_us"]["b2"], 2000);
   EXPECT_EQ(end.fields["result"]["skew_us"], 2000);
   EXPECT_EQ(call("system.status")["state"], "idle");
+}
+
+TEST_F(Live, TheProjectorsDelayIsMeasuredAndKept) {
+  begin();
+  fake_->set_latency(milliseconds(40));
+  const SeenEvent end = end_of_task(call("projector.calibrate")["task"]);
+  ASSERT_EQ(end.fields["state"], "done") << end.fields;
+  EXPECT_EQ(end.fields["kind"], "projector_calibration");
+  const Json result = end.fields["result"];
+  EXPECT_EQ(result["camera"], "f0");
+  EXPECT_EQ(result["contrast"], 190);
+  EXPECT_GE(result["measured_us"], 40'000);
+  EXPECT_GE(result["delay_us"], result["measured_us"].get<int>() + 16'000) << "one refresh for safety";
+  const auto kept = read_projector_delay(projector_delay_file(options_.config.booth.state_directory));
+  ASSERT_TRUE(kept);
+  EXPECT_EQ(kept->projector, "beamer");
+  EXPECT_EQ(kept->delay_us, result["delay_us"]);
+  EXPECT_EQ(fake_->shown().back(), -1) << "dark";
+  ASSERT_TRUE(wait_until([&] { return kinds().empty(); }));
+  EXPECT_EQ(end_of(capture()), "done") << failure_;
+}
+
+TEST_F(Live, AProjectorThatNoCameraSeesIsNotCalibrated) {
+  begin();
+  fake_->set_latency(seconds(100));
+  const SeenEvent end = end_of_task(call("projector.calibrate")["task"]);
+  EXPECT_EQ(end.fields["state"], "failed");
+  EXPECT_EQ(end.fields["error"]["message"], "f1: does not see the light of beamer; darken the booth, or expose longer");
+  EXPECT_FALSE(read_projector_delay(projector_delay_file(options_.config.booth.state_directory)));
 }
 
 TEST_F(Live, TheBackgroundIsLearnedFromSeveralFrames) {
