@@ -7,6 +7,7 @@
 #include "pipeline/export/avatar_files.h"
 #include "replay/durable_folder.h"
 #include "replay/recording.h"
+#include "replay/scan_file.h"
 
 namespace booth {
 namespace {
@@ -115,6 +116,13 @@ Result<CaptureFrames> load_capture(const Recording& recording, FaceMode face, co
     LoadedShot patterns = load_shot(recording, *scan, work);
     append(warnings, patterns.faults);
     capture.face = {*scan->pattern, std::move(patterns.sets)};
+  }
+  if (wants_scan(face)) {
+    auto file = find_scan_file(recording.folder);
+    if (!file)
+      warnings->push_back(file.error().message);
+    else if (*file)
+      capture.face_scan = std::move((*file)->mesh);
   }
   return capture;
 }

@@ -8,6 +8,7 @@
 #include <utility>
 
 #include "pipeline/face/expressions.h"
+#include "pipeline/face/external_scan.h"
 #include "pipeline/face/face_evidence.h"
 #include "pipeline/face/face_patch.h"
 #include "pipeline/face/face_sewing.h"
@@ -147,8 +148,17 @@ struct FaceSurface {
 Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Silhouette> silhouettes, const Field& hull,
                               const ReconstructionOptions& options, const Work& work,
                               std::vector<std::string>* warnings) {
-  const auto head = find_head(extract_surface(hull, work));
+  const Mesh surface = extract_surface(hull, work);
+  const auto head = find_head(surface);
   if (!head) return Error{ErrorCode::no_subject, "no head was found"};
+  if (capture.face_scan) {
+    const auto placed = place_external_scan(*capture.face_scan, surface, *head, work);
+    auto meshed = placed ? mesh_scan(placed->scan, {}, work) : placed.error();
+    if (meshed) return FaceSurface{FaceMode::active, *head, std::move(*meshed), placed->eye, {}};
+    const Error refused{meshed.error().code, "the scan in the face's file is not used: " + meshed.error().message};
+    if (!capture.face) return refused;
+    warnings->push_back(refused.message);
+  }
   auto scanned =
       scan_structured_light(capture.rig, *capture.face, silhouettes, head->box(), options.structured_light, work);
   if (!scanned) return scanned.error();
@@ -190,7 +200,7 @@ std::optional<FaceSurface> make_face(const CaptureFrames& capture, const VisualH
                                      const ReconstructionOptions& options, const FaceModelSource& face_model,
                                      const Work& work, std::vector<std::string>* warnings) {
   if (options.face == FaceMode::none) return std::nullopt;
-  if (wants_scan(options.face) && capture.face) {
+  if (wants_scan(options.face) && (capture.face || capture.face_scan)) {
     auto scanned = scan_face(capture, silhouettes, hull.field, options, work, warnings);
     if (scanned) return std::move(*scanned);
     const bool fits = options.face == FaceMode::automatic && face_model;

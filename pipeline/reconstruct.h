@@ -63,6 +63,7 @@ struct CaptureFrames {
   std::vector<FrameSet> background;          ///< the empty booth, one set a repetition
   FrameSet body;                             ///< the subject, one trigger
   std::optional<GrayCodeCapture> face = {};  ///< the face under structured light, where it was taken
+  std::optional<Mesh> face_scan = {};        ///< another scanner's face, see place_external_scan; used before `face`
 };
 
 /// What the passive face needs besides a capture. It takes a second to load and serves any number of reconstructions.
