@@ -7,6 +7,7 @@
 #include <array>
 #include <bit>
 #include <cmath>
+#include <deque>
 #include <limits>
 #include <numbers>
 #include <numeric>
@@ -22,6 +23,7 @@ constexpr int search_steps = 12;  // to each side of the integer position: a bit
 constexpr size_t most_bits = 16;  // of a coordinate
 constexpr int candidates = 2 * search_steps + 1;
 constexpr size_t row_grain = 16;  // rows in a piece of parallel work
+constexpr int clearly_lit = 12;   // grey levels between a pattern and its inverse
 constexpr int fewest_lit = 200;   // pixels below which there is nothing to decode
 
 /// One bit of a coordinate: the images that show it.
@@ -30,12 +32,14 @@ struct BitImages {
   const Image* inverse = nullptr;
   bool complete() const { return pattern != nullptr && inverse != nullptr; }
   bool missing() const { return pattern == nullptr && inverse == nullptr; }
+  /// Of both images at a sample: what is lit evenly shows, without the pattern.
+  int sum(size_t i) const { return pattern->samples[i] + inverse->samples[i]; }
 };
 
 /// The sequence, sorted by what each image shows. Bits from the most significant.
 struct Sequence {
   int width = 0, height = 0;
-  std::vector<Image> converted;                ///< grey copies of colour images
+  std::deque<Image> converted;                 ///< grey copies of colour images, and moved ones
   std::array<std::vector<BitImages>, 2> bits;  ///< of columns, of rows
   const Image* white = nullptr;
   const Image* black = nullptr;
@@ -60,7 +64,6 @@ Result<Sequence> sort_images(std::span<const Frame> frames, const GrayCodePatter
     return Error{ErrorCode::unsupported, "the Gray-code pattern is wider or higher than 65536 pixels"};
   if (frames.empty()) return Error{ErrorCode::no_subject, "the Gray-code sequence has no images"};
   Sequence sequence;
-  sequence.converted.reserve(frames.size());
   std::vector<const Image*> shown(static_cast<size_t>(pattern_count(pattern)), nullptr);
   for (const Frame& frame : frames) {
     if (frame.index < 0 || static_cast<size_t>(frame.index) >= shown.size()) continue;
@@ -88,31 +91,197 @@ Result<Sequence> sort_images(std::span<const Frame> frames, const GrayCodePatter
   return sequence;
 }
 
-/// A pattern that was not projected when its image was taken (the projector did not step, or an image stands twice in
-/// the sequence) shows in the sum with its inverse, which is the same for all bits.
-void drop_contradicting(Sequence* sequence, const std::string& camera, std::vector<std::string>* warnings) {
-  constexpr int stride = 8;                // every eighth pixel of every eighth row tells enough
-  constexpr double tolerated_share = 0.3;  // of the lit pixels
-  if (sequence->white == nullptr || sequence->black == nullptr) return;
-  for (size_t axis = 0; axis < 2; ++axis)
-    for (size_t bit = 0; bit < sequence->bits[axis].size(); ++bit) {
-      BitImages& images = sequence->bits[axis][bit];
-      if (!images.complete()) continue;
-      size_t lit = 0, contradicting = 0;
-      for (int y = 0; y < sequence->height; y += stride)
-        for (int x = 0; x < sequence->width; x += stride) {
-          const int white = sequence->white->at(x, y), black = sequence->black->at(x, y);
-          constexpr int clearly_lit = 16;
-          if (white - black < clearly_lit) continue;
-          ++lit;
-          const int sum = images.pattern->at(x, y) + images.inverse->at(x, y);
-          if (2 * std::abs(sum - white - black) > white - black) ++contradicting;
-        }
-      if (lit == 0 || static_cast<double>(contradicting) < tolerated_share * static_cast<double>(lit)) continue;
-      images = {};
-      warnings->push_back("camera " + camera + ": the images of " + (axis == 0 ? "column" : "row") + " bit " +
-                          std::to_string(bit) + " contradict the others and were left out");
+/// Calls `visit` with the samples that clearly show whether they are lit: by far different in both images.
+template <class Visitor>
+void for_each_lit(const Sequence& s, const BitImages& pair, const Visitor& visit) {
+  constexpr int stride = 8;  // every eighth pixel of every eighth row tells enough
+  for (int y = 0; y < s.height; y += stride)
+    for (int x = 0; x < s.width; x += stride) {
+      const size_t i = static_cast<size_t>(y) * static_cast<size_t>(s.width) + static_cast<size_t>(x);
+      const int contrast = std::abs(pair.pattern->samples[i] - pair.inverse->samples[i]);
+      if (contrast >= clearly_lit) visit(i, contrast);
     }
+}
+
+/// Whether the sums of two pairs, which are the same without a fault, differ at many lit pixels.
+bool contradict(const Sequence& s, const BitImages& reference, const BitImages& pair) {
+  constexpr double tolerated_share = 0.3;
+  size_t lit = 0, contradicting = 0;
+  for_each_lit(s, reference, [&](size_t i, int contrast) {
+    ++lit;
+    if (2 * std::abs(pair.sum(i) - reference.sum(i)) > contrast) ++contradicting;
+  });
+  return lit > 0 && static_cast<double>(contradicting) >= tolerated_share * static_cast<double>(lit);
+}
+
+/// Whether two images show the same, apart from noise, where the projector lights.
+bool same(const Sequence& s, const BitImages& reference, const Image& a, const Image& b) {
+  constexpr double tolerated_share = 0.15;
+  size_t lit = 0, different = 0;
+  for_each_lit(s, reference, [&](size_t i, int contrast) {
+    ++lit;
+    if (3 * std::abs(a.samples[i] - b.samples[i]) > contrast) ++different;
+  });
+  return static_cast<double>(different) < tolerated_share * static_cast<double>(lit);
+}
+
+/// A pattern that was not projected when its image was taken (the projector did not step, or an image stands twice in
+/// the sequence) shows in the sum with its inverse, which is the same for all bits. Of the two, the one that repeats
+/// the image before it is left out; where neither does, both.
+void drop_contradicting(Sequence* s, const std::string& camera, std::vector<std::string>* warnings) {
+  std::vector<BitImages*> pairs;
+  for (auto& bits : s->bits)
+    for (BitImages& bit : bits)
+      if (bit.complete()) pairs.push_back(&bit);
+  // What most agree with is right: lit and unlit, usually.
+  std::optional<BitImages> reference;
+  const auto agreed = [&](const BitImages& candidate) {
+    const auto against = std::count_if(pairs.begin(), pairs.end(),
+                                       [&](const BitImages* pair) { return contradict(*s, candidate, *pair); });
+    return 2 * static_cast<size_t>(against) < pairs.size();
+  };
+  if (s->white != nullptr && s->black != nullptr) {
+    if (const BitImages lit_and_unlit{s->white, s->black}; agreed(lit_and_unlit)) {
+      reference = lit_and_unlit;
+    } else {
+      s->white = s->black = nullptr;
+      warnings->push_back("camera " + camera + ": the lit and the unlit image contradict the others and were left out");
+    }
+  }
+  constexpr size_t most_tried = 4;
+  for (size_t p = 0; p < std::min(pairs.size(), most_tried) && !reference; ++p)
+    if (agreed(*pairs[p])) reference = *pairs[p];
+  if (!reference) return;
+  const Image* before = nullptr;
+  for (size_t axis = 0; axis < 2; ++axis)
+    for (size_t bit = 0; bit < s->bits[axis].size(); ++bit) {
+      BitImages& images = s->bits[axis][bit];
+      const BitImages shown = images;
+      if (images.complete() && contradict(*s, *reference, images)) {
+        const std::string name = (axis == 0 ? "column bit " : "row bit ") + std::to_string(bit);
+        if (same(*s, *reference, *images.pattern, *images.inverse)) {
+          images.inverse = nullptr;
+          warnings->push_back("camera " + camera + ": the inverse of " + name +
+                              " repeats the image before and was left out");
+        } else if (before != nullptr && same(*s, *reference, *before, *images.pattern)) {
+          images.pattern = nullptr;
+          warnings->push_back("camera " + camera + ": the image of " + name +
+                              " repeats the one before and was left out");
+        } else {
+          images = {};
+          warnings->push_back("camera " + camera + ": the images of " + name +
+                              " contradict the others and were left out");
+        }
+      }
+      before = shown.inverse != nullptr ? shown.inverse : shown.pattern;
+    }
+}
+
+/// How the image of the subject moves: for every bit, columns' first, where its images show what the finest column
+/// bit's show at a pixel, relative to that pixel.
+using Motion = std::vector<Eigen::Vector2d>;
+
+/// The shift of the whole subject that explains best how the sums of pattern and inverse change (B. Lucas, T. Kanade,
+/// "An iterative image registration technique", IJCAI 1981).
+Motion measure_motion(const Sequence& s, const Image* subject) {
+  std::vector<const BitImages*> bits;
+  for (const auto& of_axis : s.bits)
+    for (const BitImages& bit : of_axis) bits.push_back(&bit);
+  Motion motion(bits.size(), Eigen::Vector2d::Zero());
+  size_t reference = s.bits[0].size() - 1;
+  while (reference > 0 && !bits[reference]->complete()) --reference;
+  if (!bits[reference]->complete()) return motion;
+
+  struct Sample {
+    int x, y, sum;
+    Eigen::Vector2d gradient;
+  };
+  std::vector<Sample> samples;
+  Eigen::Matrix2d structure = Eigen::Matrix2d::Identity();
+  constexpr int stride = 6, margin = 12;  // no shift reaches farther
+  const BitImages& first = *bits[reference];
+  const size_t down = static_cast<size_t>(s.width);
+  for (int y = margin; y + margin < s.height; y += stride)
+    for (int x = margin; x + margin < s.width; x += stride) {
+      const size_t i = static_cast<size_t>(y) * down + static_cast<size_t>(x);
+      if (std::abs(first.pattern->samples[i] - first.inverse->samples[i]) < clearly_lit) continue;
+      if (subject != nullptr && subject->at(x, y) < 128) continue;
+      samples.push_back(
+          {x,
+           y,
+           first.sum(i),
+           {0.5 * (first.sum(i + 1) - first.sum(i - 1)), 0.5 * (first.sum(i + down) - first.sum(i - down))}});
+      structure += samples.back().gradient * samples.back().gradient.transpose();
+    }
+  if (samples.size() < fewest_lit) return motion;
+  const Eigen::Matrix2d inverse = structure.inverse();
+  const auto change = [&](const BitImages& bit, const Sample& sample, const Eigen::Vector2d& shift) {
+    const double px = sample.x + shift.x(), py = sample.y + shift.y();
+    const int x = static_cast<int>(px), y = static_cast<int>(py);
+    const double a = px - x, b = py - y;
+    const size_t i = static_cast<size_t>(y) * down + static_cast<size_t>(x);
+    return (1 - b) * ((1 - a) * bit.sum(i) + a * bit.sum(i + 1)) +
+           b * ((1 - a) * bit.sum(i + down) + a * bit.sum(i + down + 1)) - sample.sum;
+  };
+  for (size_t bit = 0; bit < bits.size(); ++bit) {
+    if (bit == reference) continue;
+    if (!bits[bit]->complete()) {
+      if (bit > 0) motion[bit] = motion[bit - 1];
+      continue;
+    }
+    constexpr int steps = 5;
+    constexpr double still_px = 0.1, farthest_px = margin - 2;
+    Eigen::Vector2d shift = bit > 0 ? motion[bit - 1] : Eigen::Vector2d(0, 0);
+    for (int i = 0; i < steps; ++i) {
+      Eigen::Vector2d moment = Eigen::Vector2d::Zero();
+      for (const Sample& sample : samples) moment -= change(*bits[bit], sample, shift) * sample.gradient;
+      const Eigen::Vector2d step = inverse * moment;
+      shift = (shift + step).cwiseMax(-farthest_px).cwiseMin(farthest_px);
+      if (step.norm() < still_px) break;
+    }
+    motion[bit] = shift;
+  }
+  return motion;
+}
+
+double largest_of(const Motion& motion) {
+  double largest = 0;
+  for (const Eigen::Vector2d& shift : motion) largest = std::max(largest, (shift - motion.front()).norm());
+  return largest;
+}
+
+/// What an image shows at `shift` from each pixel.
+Image moved(const Image& image, const Eigen::Vector2d& shift) {
+  const int left = static_cast<int>(std::floor(shift.x())), up = static_cast<int>(std::floor(shift.y()));
+  constexpr int unit = 64;  // of the weights
+  const int a = static_cast<int>(std::lround((shift.x() - left) * unit)),
+            b = static_cast<int>(std::lround((shift.y() - up) * unit));
+  Image out(image.width, image.height, 1);
+  for (int y = 0; y < image.height; ++y) {
+    const int y0 = std::clamp(y + up, 0, image.height - 1), y1 = std::clamp(y + up + 1, 0, image.height - 1);
+    for (int x = 0; x < image.width; ++x) {
+      const int x0 = std::clamp(x + left, 0, image.width - 1), x1 = std::clamp(x + left + 1, 0, image.width - 1);
+      const int value = (unit - b) * ((unit - a) * image.at(x0, y0) + a * image.at(x1, y0)) +
+                        b * ((unit - a) * image.at(x0, y1) + a * image.at(x1, y1));
+      out.at(x, y) = static_cast<uint8_t>((value + unit * unit / 2) / (unit * unit));
+    }
+  }
+  return out;
+}
+
+/// Moves all images so that the subject stands where it stood when the finest column bit was shown.
+void hold_still(const Motion& motion, Sequence* s) {
+  const auto move = [&](const Image** image, const Eigen::Vector2d& shift) {
+    if (*image != nullptr && !shift.isZero()) *image = &s->converted.emplace_back(moved(**image, shift));
+  };
+  size_t next = 0;
+  for (auto& of_axis : s->bits)
+    for (BitImages& bit : of_axis) {
+      move(&bit.pattern, motion[next]);
+      move(&bit.inverse, motion[next++]);
+    }
+  move(&s->white, motion.back());
+  move(&s->black, motion.back());
 }
 
 /// The finest bits' difference relative to the contrast, by position: a square wave that the optics blur.
@@ -310,8 +479,7 @@ class Decoder {
     return 0;
   }
 
-  /// Noise: how much the sums of pattern and inverse differ. Motion: the shift of the image that explains best how
-  /// these sums change, by least squares over the lit pixels (B. Lucas, T. Kanade, 1981).
+  /// How much the sums of pattern and inverse differ.
   void measure_noise(ProjectorCoordinates* out) {
     std::vector<const BitImages*> pairs;
     for (const auto& bits : s_.bits)
@@ -321,27 +489,12 @@ class Decoder {
     out->noise = noise_ = assumed_noise;
     if (pairs.size() < 2) return;
     constexpr int stride = 4;
-    const BitImages& first = *pairs.front();
-    std::vector<Eigen::Vector2d> moments(pairs.size(), Eigen::Vector2d::Zero());
-    Eigen::Matrix2d structure = Eigen::Matrix2d::Zero();
     std::vector<int> spread;
-    for (int y = stride; y + 1 < s_.height; y += stride)
-      for (int x = stride; x + 1 < s_.width; x += stride) {
+    for (int y = 0; y < s_.height; y += stride)
+      for (int x = 0; x < s_.width; x += stride) {
         const size_t i = static_cast<size_t>(y) * static_cast<size_t>(s_.width) + static_cast<size_t>(x);
-        constexpr int clearly_lit = 12;
-        if (std::abs(difference(first, i, 0)) < clearly_lit) continue;
-        const auto sum = [](const BitImages& pair, size_t at) {
-          return pair.pattern->samples[at] + pair.inverse->samples[at];
-        };
-        const size_t down = static_cast<size_t>(s_.width);
-        const Eigen::Vector2d gradient(0.5 * (sum(first, i + 1) - sum(first, i - 1)),
-                                       0.5 * (sum(first, i + down) - sum(first, i - down)));
-        structure += gradient * gradient.transpose();
-        for (size_t p = 1; p < pairs.size(); ++p) {
-          const int change = sum(*pairs[p], i) - sum(first, i);
-          moments[p] -= change * gradient;
-          if (p % 4 == 1) spread.push_back(std::abs(change));
-        }
+        if (std::abs(difference(*pairs.front(), i, 0)) < clearly_lit) continue;
+        for (size_t p = 1; p < pairs.size(); p += 4) spread.push_back(std::abs(pairs[p]->sum(i) - pairs[0]->sum(i)));
       }
     if (spread.size() < fewest_lit) return;
     const auto middle = spread.begin() + static_cast<std::ptrdiff_t>(spread.size() / 2);
@@ -349,9 +502,6 @@ class Decoder {
     constexpr double normal_mad = 0.6745;
     constexpr double images_in_change = 4;
     out->noise = noise_ = std::max(0.3, (*middle + 0.5) / normal_mad / std::sqrt(images_in_change));
-    structure.diagonal().array() += 1;
-    for (const Eigen::Vector2d& moment : moments)
-      out->motion_px = std::max(out->motion_px, structure.ldlt().solve(moment).norm());
   }
 
   /// The first and one past the last pixel of a row that may be decoded.
@@ -736,6 +886,10 @@ Result<ProjectorCoordinates> decode_gray_code(std::span<const Frame> frames, con
     subject = nullptr;
   ProjectorCoordinates out;
   out.camera = frames.front().camera;
+  const Motion motion = measure_motion(*sequence, subject);
+  out.motion_px = largest_of(motion);
+  constexpr double noticeable_px = 0.4;
+  if (out.motion_px > noticeable_px) hold_still(motion, &*sequence);
   drop_contradicting(&*sequence, out.camera, &out.warnings);
   if (const auto decoded = Decoder(*sequence, pattern, subject, options, work).run(&out); !decoded)
     return Error{decoded.error().code, "camera " + out.camera + ": " + decoded.error().message};

@@ -38,7 +38,10 @@ struct ProjectorCoordinates {
 /// reaches a pixel by way of other surfaces (it is equal in both). Where one of the two is missing, the other is
 /// compared with the mean of lit and unlit. The position between the stripes' edges then comes from the finest four
 /// bits' differences relative to the contrast: they are square waves blurred by an amount that is measured over the
-/// whole image, and one or another of them is at its steepest everywhere. A plane fitted to each pixel's neighbours
+/// whole image, and one or another of them is at its steepest nearly everywhere; where only a coarser bit has an edge,
+/// that one's difference tells. What is too dim by itself is averaged with its surroundings, as far as the noise, which
+/// every pixel's sums of pattern and inverse show, asks for. Where the image of the subject moves during the sequence,
+/// all images are moved to where it is when the finest column bit is shown. A plane fitted to each pixel's neighbours
 /// that continue it averages the noise; pixels that no neighbours continue are dropped.
 ///
 /// @param frames   of one camera, grey or RGB, index as in recording.json's order; at most one per index

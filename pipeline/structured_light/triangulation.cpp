@@ -171,6 +171,35 @@ Result<RangeScan> triangulate(const Rig& rig, std::span<const ProjectorCoordinat
                  view.intrinsics.fx, world_from_camera.col(2)};
   };
 
+  // A subject that moves is lit elsewhere when its rows are shown than when its columns are. Cameras have been brought
+  // to one moment; what they measure without the projector says by how much its coordinates are off.
+  constexpr double noticeable_px = 0.4;
+  Eigen::Vector2d lit_off = Eigen::Vector2d::Zero();
+  if (projector != nullptr && sources.size() > 1 &&
+      std::any_of(views.begin(), views.end(), [&](const auto& view) { return view.motion_px > noticeable_px; })) {
+    std::array<std::vector<double>, 2> off;
+    constexpr int stride = 7;
+    for (int y = 0; y < height; y += stride)
+      for (int x = 0; x < width; x += stride) {
+        std::vector<Sight> sights;
+        for (const Source& source : sources)
+          if (const float* at = source.map.pixel(x, y); at[0] == at[0])
+            sights.push_back(sight(*source.camera, source.rays.at(Eigen::Vector2d(at[0], at[1])), at[2]));
+        const auto found = sights.size() < 2 ? std::nullopt : meet(sights);
+        if (!found || found->residual_px > options.most_residual_px) continue;
+        const auto lit = project(*projector, found->point);
+        if (!lit) continue;
+        off[0].push_back(lit->x() - x);
+        off[1].push_back(lit->y() - y);
+      }
+    constexpr size_t fewest = 50;
+    for (size_t axis = 0; axis < 2 && off[0].size() >= fewest; ++axis) {
+      const auto middle = off[axis].begin() + static_cast<std::ptrdiff_t>(off[axis].size() / 2);
+      std::nth_element(off[axis].begin(), middle, off[axis].end());
+      lit_off[static_cast<Eigen::Index>(axis)] = *middle;
+    }
+  }
+
   RangeScan scan(width, height);
   constexpr size_t row_grain = 16;
   work.parallel_for(static_cast<size_t>(height), row_grain, [&](size_t begin, size_t end) {
@@ -186,7 +215,7 @@ Result<RangeScan> triangulate(const Rig& rig, std::span<const ProjectorCoordinat
         if (sights.empty()) continue;
         constexpr double projector_sigma_px = 0.02;  // the pixel is exact; its calibration is not
         if (projector != nullptr)
-          sights.push_back(sight(*projector, projector_rays->at(Eigen::Vector2d(x, y)), projector_sigma_px));
+          sights.push_back(sight(*projector, projector_rays->at(Eigen::Vector2d(x, y) + lit_off), projector_sigma_px));
         if (sights.size() < 2) continue;
         auto found = meet(sights);
         if (sights.size() > 2 && (!found || found->residual_px > options.most_residual_px)) {

@@ -29,6 +29,11 @@ ReconstructionOptions coarse() {
   return options;
 }
 
+std::string text_of(const fs::path& file) {
+  std::ifstream stream(file, std::ios::binary);
+  return {std::istreambuf_iterator<char>(stream), {}};
+}
+
 class ReconstructJob : public testing::Test {
  protected:
   ReconstructJob() {
@@ -45,17 +50,29 @@ class ReconstructJob : public testing::Test {
         folder_ / "recording", folder_ / "out/avatar", options, {}, {}, work,
         [this](std::string_view stage, double fraction) { news_.emplace_back(stage, fraction); });
   }
+  /// A face scan of which every image is the empty booth's: nothing is projected.
+  void add_unlit_face_scan() const {
+    std::string frames;
+    for (const char* camera : {"body-00", "body-01"})
+      for (int index = 0; index < 14; ++index)
+        frames += std::string(frames.empty() ? "" : ",") + R"({"camera":")" + camera + R"(","index":)" +
+                  std::to_string(index) + R"(,"file":"frames/background/)" + camera +
+                  R"(-000.jpg","timestamp_ns":1,"frame_id":1,"exposure_us":8000,"gain_db":0})";
+    const fs::path file = folder_ / "recording/recording.json";
+    std::string text = text_of(file);
+    const std::string shots = "\"shots\": [";
+    text.insert(text.find(shots) + shots.size(),
+                R"({"name":"face","role":"gray_code","pattern":{"width":8,"height":8,"columns":true,"rows":true,)"
+                R"("inverse":true},"frames":[)" +
+                    frames + "]},");
+    std::ofstream(file) << text;
+  }
   bool nothing_is_left() const { return !fs::exists(folder_ / "out") || fs::is_empty(folder_ / "out"); }
 
   fs::path folder_ = fs::temp_directory_path() / ("reconstruct-job-" + std::to_string(getpid()));
   ThreadPool pool_;
   std::vector<std::pair<std::string, double>> news_;
 };
-
-std::string text_of(const fs::path& file) {
-  std::ifstream stream(file, std::ios::binary);
-  return {std::istreambuf_iterator<char>(stream), {}};
-}
 
 TEST_F(ReconstructJob, PublishesACompleteAvatar) {
   const auto report = run();
@@ -74,6 +91,30 @@ TEST_F(ReconstructJob, PublishesACompleteAvatar) {
   std::vector<std::string> stages;
   for (const auto& [stage, seconds] : report->stage_seconds) stages.push_back(stage);
   EXPECT_EQ(stages, job_stages());
+}
+
+TEST_F(ReconstructJob, MakesTheAvatarWithoutAFaceScanThatIsTooPoor) {
+  add_unlit_face_scan();
+  const auto report = run();
+  ASSERT_TRUE(report.ok()) << report.error().message;
+  EXPECT_TRUE(fs::is_regular_file(folder_ / "out/avatar/avatar.glb"));
+  EXPECT_TRUE(std::any_of(report->warnings.begin(), report->warnings.end(), [](const std::string& warning) {
+    return warning.find("hardly any pixel is lit") != std::string::npos;
+  }));
+}
+
+TEST_F(ReconstructJob, MakesTheAvatarWithoutAFaceFileThatIsUnusable) {
+  const auto warned = [&](const std::string& of) {
+    const auto report = run();
+    EXPECT_TRUE(report.ok()) << report.error().message;
+    return report && std::any_of(report->warnings.begin(), report->warnings.end(),
+                                 [&](const std::string& warning) { return warning.find(of) != std::string::npos; });
+  };
+  std::ofstream(folder_ / "recording/face.ply") << "nonsense";
+  EXPECT_TRUE(warned("face.ply: the first line"));
+  std::ofstream(folder_ / "recording/face.ply") << "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n"
+                                                   "property float y\nproperty float z\nend_header\n0 0 0\n";
+  EXPECT_TRUE(warned("it has only 1 points"));
 }
 
 TEST_F(ReconstructJob, TellsProgressThatNeverFallsAndEndsAtOne) {

@@ -43,8 +43,7 @@ std::vector<uint8_t> member_of(const fs::path& file, const std::string& name) {
     const size_t local = number_at<uint32_t>(zip, at + 42);
     if (std::string(zip.begin() + static_cast<long>(at) + 46, zip.begin() + static_cast<long>(at) + 46 + name_size) ==
         name) {
-      const size_t data =
-          local + 30 + number_at<uint16_t>(zip, local + 26) + number_at<uint16_t>(zip, local + 28);
+      const size_t data = local + 30 + number_at<uint16_t>(zip, local + 26) + number_at<uint16_t>(zip, local + 28);
       std::vector<uint8_t> out(size);
       if (number_at<uint16_t>(zip, at + 10) == 0) {
         out.assign(zip.begin() + static_cast<long>(data), zip.begin() + static_cast<long>(data + size));
@@ -100,8 +99,8 @@ FaceTruth read_face_truth(const fs::path& recording) {
   for (const fs::path& file : files)
     for (const Eigen::Vector3f& point : points_of(file)) {
       const Eigen::Vector3d p = point.cast<double>(), from_head = p - head;
-      const bool on_face = from_head.y() > -0.08 && p.y() < crown - 0.04 && from_head.z() > 0.02 &&
-                           std::abs(from_head.x()) < 0.09;
+      const bool on_face =
+          from_head.y() > -0.08 && p.y() < crown - 0.04 && from_head.z() > 0.02 && std::abs(from_head.x()) < 0.09;
       if (!on_face) continue;  // NaN is not, either
       const auto at = project(projector, p);
       if (!at || at->minCoeff() < 1 || at->x() > projector.intrinsics.width - 2 ||
@@ -130,9 +129,9 @@ ScanErrors compare(const RangeScan& scan, const FaceTruth& truth) {
               y = std::clamp(static_cast<int>(std::floor(at.y())), 0, scan.height - 2);
     const float a = static_cast<float>(at.x()) - static_cast<float>(x),
                 b = static_cast<float>(at.y()) - static_cast<float>(y);
-    const std::array<Eigen::Vector3f, 4> corner{
-        scan.points[scan.index(x, y)], scan.points[scan.index(x + 1, y)], scan.points[scan.index(x, y + 1)],
-        scan.points[scan.index(x + 1, y + 1)]};
+    const std::array<Eigen::Vector3f, 4> corner{scan.points[scan.index(x, y)], scan.points[scan.index(x + 1, y)],
+                                                scan.points[scan.index(x, y + 1)],
+                                                scan.points[scan.index(x + 1, y + 1)]};
     Eigen::Vector3f found = (1 - b) * ((1 - a) * corner[0] + a * corner[1]) + b * ((1 - a) * corner[2] + a * corner[3]);
     constexpr float another_surface_m = 0.004F;  // nothing lies between them
     const bool torn = std::max((corner[0] - corner[3]).norm(), (corner[1] - corner[2]).norm()) > another_surface_m;
