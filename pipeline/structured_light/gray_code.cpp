@@ -138,7 +138,16 @@ void drop_contradicting(Sequence* s, const std::string& camera, std::vector<std:
   const auto agreed = [&](const BitImages& candidate) {
     const auto against = std::count_if(pairs.begin(), pairs.end(),
                                        [&](const BitImages* pair) { return contradict(*s, candidate, *pair); });
-    return 2 * static_cast<size_t>(against) < pairs.size();
+    // A pattern that stands in the lit image's place agrees where its stripes are lit.
+    constexpr double tolerated_share = 0.3;
+    size_t lit = 0, weaker = 0;
+    if (!pairs.empty())
+      for_each_lit(*s, *pairs.front(), [&](size_t i, int contrast) {
+        ++lit;
+        if (2 * std::abs(candidate.pattern->samples[i] - candidate.inverse->samples[i]) < contrast) ++weaker;
+      });
+    return 2 * static_cast<size_t>(against) < pairs.size() &&
+           static_cast<double>(weaker) <= tolerated_share * static_cast<double>(lit);
   };
   if (s->white != nullptr && s->black != nullptr) {
     if (const BitImages lit_and_unlit{s->white, s->black}; agreed(lit_and_unlit)) {
