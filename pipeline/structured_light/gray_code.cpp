@@ -581,6 +581,13 @@ class Decoder {
     return sum / static_cast<float>(std::max<size_t>(coarse_.size(), 1));
   }
 
+  /// Whether lit and unlit alone say that nothing around a pixel is lit by half of what is asked for.
+  bool hopeless(int x, int y, int radius, float noise, const RowBuffers& b) const {
+    constexpr float share = 0.5F;
+    return lit_and_unlit_.complete() && mean_difference(lit_and_unlit_, x, y, radius, b) <
+                                            share * min_snr_ * noise / static_cast<float>(2 * radius + 1);
+  }
+
   void read_row(int y, RowBuffers* buffers) {
     const auto [first, last] = span_of(y);
     sum_row(y, buffers->sum.data());
@@ -598,6 +605,7 @@ class Decoder {
           static_cast<float>(buffers->strength[i]) / static_cast<float>(std::max<size_t>(coarse_.size(), 1));
       constexpr float certain_snr = 4;
       constexpr int widest = 2;
+      if (pixel.contrast < certain_snr * pixel.noise && hopeless(x, y, widest, pixel.noise, *buffers)) continue;
       while (pixel.contrast <
                  (radius == 0 ? certain_snr : min_snr_) * pixel.noise / static_cast<float>(2 * radius + 1) &&
              radius <= widest)

@@ -52,7 +52,7 @@ cv::Mat matrix_of(const Image& image) {
 }
 cv::Matx33d camera_matrix(const Intrinsics& k) { return {k.fx, k.skew, k.cx, 0, k.fy, k.cy, 0, 0, 1}; }
 cv::Mat distortion(const Intrinsics& k) {
-  return cv::Mat(k.distortion.size(), 1, CV_64F, const_cast<double*>(k.distortion.data()));
+  return cv::Mat(static_cast<int>(k.distortion.size()), 1, CV_64F, const_cast<double*>(k.distortion.data()));
 }
 cv::Matx34d projection(const CalibratedView& view) {
   cv::Matx34d p;
