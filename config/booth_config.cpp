@@ -57,6 +57,14 @@ void visit_capture(Visitor& visitor, CaptureConfig& capture) {
 }
 
 template <class Visitor>
+void visit_background(Visitor& visitor, BackgroundConfig& background) {
+  visitor.integer("max_age_h", background.max_age_h, 0, 8760);
+  visitor.number("max_light_factor", background.max_light_factor, 1.05, 10);
+  visitor.boolean("relearn", background.relearn);
+  visitor.integer("quiet_s", background.quiet_s, 5, 86400);
+}
+
+template <class Visitor>
 void visit_disk(Visitor& visitor, DiskConfig& disk) {
   visitor.integer("reserve_mib", disk.reserve_mib, 0, 10'000'000);
   visitor.integer("limit_mib", disk.limit_mib, 0, 100'000'000);
@@ -353,6 +361,7 @@ void visit_config(Visitor& visitor, BoothConfig& config) {
   visitor.section("booth", [&](auto& section) { visit_booth(section, config.booth); });
   visitor.section("api", [&](auto& section) { visit_api(section, config.api); });
   visitor.section("capture", [&](auto& section) { visit_capture(section, config.capture); });
+  visitor.section("background", [&](auto& section) { visit_background(section, config.background); });
   visitor.section("disk", [&](auto& section) { visit_disk(section, config.disk); });
   visitor.section("jobs", [&](auto& section) { visit_jobs(section, config.jobs); });
   visitor.section("log", [&](auto& section) { visit_log(section, config.log); });

@@ -44,6 +44,13 @@ struct CaptureConfig {
   SpoolOptions images;         ///< how recordings store them
 };
 
+struct BackgroundConfig {
+  int max_age_h = 24;             ///< older than that it is to be learned again, 1 … 8760; 0: never
+  double max_light_factor = 1.5;  ///< by how much the light may have changed since it was learned, 1.05 … 10
+  bool relearn = true;            ///< the booth learns it again by itself when nobody is in it
+  int quiet_s = 60;               ///< so long after the last capture it is taken to be empty, 5 … 86400
+};
+
 struct DiskConfig {
   int reserve_mib = 2048;  ///< space that is never used: below it no capture starts, 0 … 10^7
   int limit_mib = 0;       ///< most that the state directory may hold, 0 … 10^8; 0: no limit
@@ -112,6 +119,7 @@ struct BoothConfig {
   IdentityConfig booth;
   ApiConfig api;
   CaptureConfig capture;
+  BackgroundConfig background;
   DiskConfig disk;
   JobsConfig jobs;
   LogConfig log;

@@ -10,6 +10,7 @@
 
 #include <algorithm>
 #include <cerrno>
+#include <ctime>
 #include <exception>
 #include <fstream>
 #include <set>
@@ -32,6 +33,7 @@ constexpr size_t most_disk_tasks = 256;
 constexpr std::chrono::milliseconds house_pause{250};
 constexpr std::chrono::milliseconds heartbeat_pause{1000};
 constexpr std::chrono::milliseconds disk_pause{2000};        ///< between two looks at the space
+constexpr std::chrono::minutes relearning_pause{5};          ///< between two tries to learn the background unasked
 constexpr std::chrono::milliseconds drain_patience{10'000};  ///< for a capture under way
 
 ErrorCode code_of(const std::string& kind) {
@@ -70,6 +72,7 @@ double resident_bytes() {
 Booth::Booth(const BoothOptions& options, const Clock& clock)
     : options_(options),
       clock_(clock),
+      health_(options.config.background, events_),
       disk_executor_("disk", most_disk_tasks),
       state_since_(std::chrono::system_clock::now()) {}
 
@@ -87,14 +90,18 @@ Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<D
   booth->adopt_orphans();
 
   const BoothConfig& config = options.config;
-  booth->runner_ = std::make_unique<JobRunner>(JobRunnerOptions{.command = options.reconstruct_command,
-                                                                .config_file = options.config_file,
-                                                                .recordings = config.booth.recordings(),
-                                                                .workers = config.jobs.workers,
-                                                                .threads = config.jobs.threads,
-                                                                .timeout = std::chrono::seconds(config.jobs.timeout_s),
-                                                                .retries = config.jobs.retries},
-                                               *booth->jobs_, *booth->avatars_, booth->events_, booth->metrics_);
+  booth->runner_ = std::make_unique<JobRunner>(
+      JobRunnerOptions{.command = options.reconstruct_command,
+                       .config_file = options.config_file,
+                       .recordings = config.booth.recordings(),
+                       .workers = config.jobs.workers,
+                       .threads = config.jobs.threads,
+                       .timeout = std::chrono::seconds(config.jobs.timeout_s),
+                       .retries = config.jobs.retries},
+      *booth->jobs_, *booth->avatars_, booth->events_, booth->metrics_,
+      [self = booth.get()](const std::string& capture, const std::vector<CameraHealth>& cameras) {
+        self->health_.report(capture, cameras);
+      });
   booth->eraser_ = std::make_unique<Eraser>(config.booth.state_directory, *booth->jobs_, *booth->avatars_,
                                             booth->session_.get(), booth->events_);
   booth->set_state(booth->device_fault_.empty() ? BoothState::idle : BoothState::fault);
@@ -151,6 +158,7 @@ Result<void> Booth::open_stores() {
 
 void Booth::open_capture(const Devices& devices) {
   load_rig(devices);
+  background_is_played_ = devices.replayed.has_value();
   if (devices.replayed) {
     const auto now = std::chrono::system_clock::now();
     if (const auto adopted = backgrounds_->adopt(*devices.replayed, make_capture_id(now), devices.replayed->created);
@@ -194,7 +202,13 @@ void Booth::open_capture(const Devices& devices) {
                    .metrics = metrics_,
                    .clock = clock_,
                    .set_state = [this](BoothState state) { set_state(state); },
-                   .check_disk = [this] { return check_disk(); }});
+                   .check_disk = [this] { return check_disk(); },
+                   .background_learned =
+                       [this](const Result<void>& learned) {
+                         if (learned) return health_.background_learned();
+                         health_.ask_for_background("the booth could not learn its background by itself: " +
+                                                    learned.error().message);
+                       }});
   constexpr size_t most_discoveries = 4;
   discoverer_ = std::make_unique<SerialExecutor>("discover", most_discoveries);
 }
@@ -370,7 +384,7 @@ CamerasDiscovered Booth::look_for_cameras() const {
 
 Result<std::string> Booth::learn_background(std::optional<int> frames) {
   if (const auto ready = check_ready({"no_background"}); !ready) return ready.error();
-  return session_->learn_background({frames.value_or(options_.config.capture.background_frames)});
+  return session_->learn_background({.frames = frames.value_or(options_.config.capture.background_frames)});
 }
 
 Result<std::string> Booth::test_trigger() {
@@ -425,6 +439,39 @@ void Booth::measure_disk() {
   if (options_.config.disk.limit_mib > 0) used_bytes_ = size_of_tree(folder);
 }
 
+std::optional<std::chrono::seconds> Booth::background_age() const {
+  const auto background = backgrounds_->current();
+  if (background == nullptr || background_is_played_) return std::nullopt;
+  std::tm utc{};
+  if (::strptime(background->created.c_str(), "%Y-%m-%dT%H:%M:%S", &utc) == nullptr) return std::nullopt;
+  const auto created = std::chrono::system_clock::from_time_t(::timegm(&utc));
+  return std::max(std::chrono::seconds(0),
+                  std::chrono::floor<std::chrono::seconds>(std::chrono::system_clock::now() - created));
+}
+
+/// A background that no longer fits is learned again while nobody is there; who could be is not learned by himself.
+void Booth::tend_background() {
+  const BackgroundConfig& config = options_.config.background;
+  if (session_ == nullptr || background_is_played_ || backgrounds_->current() == nullptr) return;
+  const auto stale = health_.staleness(background_age());
+  if (!stale) return;
+  if (!config.relearn) return health_.ask_for_background(*stale);
+  const auto now = SteadyClock::now();
+  {
+    const std::lock_guard lock(state_mutex_);
+    if (state_ != BoothState::idle || now < next_relearning_ ||
+        std::chrono::system_clock::now() - state_since_ < std::chrono::seconds(config.quiet_s))
+      return;
+  }
+  if (!check_ready({})) return;
+  next_relearning_ = now + relearning_pause;
+  spdlog::info("the background is learned again: {}", *stale);
+  if (const auto task =
+          session_->learn_background({.frames = options_.config.capture.background_frames, .unattended = true});
+      !task)
+    spdlog::warn("the background is not learned again: {}", task.error().message);
+}
+
 void Booth::keep_house(const std::stop_token& stop) {
   auto next_heartbeat = SteadyClock::now(), next_disk = next_heartbeat;
   bool disk_was_full = false;
@@ -438,6 +485,7 @@ void Booth::keep_house(const std::stop_token& stop) {
         const auto disk = check_disk();
         if (!disk && !disk_was_full) events_.publish(Alert{Severity::error, "disk_full", disk.error().message});
         disk_was_full = !disk;
+        tend_background();
       }
       refresh();
       if (now >= next_heartbeat) {
@@ -474,7 +522,10 @@ BoothStatus Booth::status() const {
     status.calibration = calibration_;
   }
   status.tasks = tasks_.list();
-  if (const auto background = backgrounds_->current()) status.background = {true, background->created};
+  status.calibration.moved = health_.moved();
+  if (const auto background = backgrounds_->current()) {
+    status.background = {.learned = true, .created = background->created, .stale = health_.staleness(background_age())};
+  }
   for (Job& job : jobs_->list())
     if (job.state != JobState::done) status.queue.push_back(std::move(job));
   status.disk = {free_bytes_, static_cast<uint64_t>(options_.config.disk.reserve_mib) * mebibyte};

@@ -19,6 +19,7 @@
 #include "daemon/capture_session.h"
 #include "daemon/eraser.h"
 #include "daemon/event_bus.h"
+#include "daemon/health_monitor.h"
 #include "daemon/job_queue.h"
 #include "daemon/job_runner.h"
 #include "daemon/metrics.h"
@@ -64,12 +65,14 @@ struct BoothOptions {
 
 struct CalibrationStatus {
   bool loaded = false;
-  std::optional<double> rms_px;  ///< the worst camera's
-  std::string created;           ///< may be empty
+  std::optional<double> rms_px;         ///< the worst camera's
+  std::string created;                  ///< may be empty
+  std::vector<std::string> moved = {};  ///< cameras that the latest capture shows not to stand where they were
 };
 struct BackgroundStatus {
   bool learned = false;
-  std::string created;  ///< may be empty
+  std::string created;                    ///< may be empty
+  std::optional<std::string> stale = {};  ///< why it is to be learned again
 };
 struct DiskStatus {
   uint64_t free_bytes = 0;
@@ -171,12 +174,15 @@ class Booth {
   Result<void> check_disk() const;
   void measure_disk();
   void keep_house(const std::stop_token& stop);
+  std::optional<std::chrono::seconds> background_age() const;
+  void tend_background();
 
   const BoothOptions options_;
   const Clock& clock_;
   const std::chrono::steady_clock::time_point started_ = std::chrono::steady_clock::now();
   EventBus events_;
   Metrics metrics_;
+  HealthMonitor health_;
   int state_lock_ = -1;  ///< an open descriptor, locked while this booth uses the state directory
 
   std::unique_ptr<JobQueue> jobs_;
@@ -189,7 +195,9 @@ class Booth {
   CalibrationStatus calibration_;   ///< guarded by rig_mutex_
   std::string rig_fault_;           ///< guarded by rig_mutex_
   std::map<std::string, int> mount_rotations_;
-  std::string device_fault_;  ///< why there are no devices; empty when there are
+  bool background_is_played_ = false;                        ///< it is that of a recording, and does not grow old
+  std::chrono::steady_clock::time_point next_relearning_{};  ///< of the housekeeper
+  std::string device_fault_;                                 ///< why there are no devices; empty when there are
   std::vector<Driver> drivers_;
   std::shared_ptr<WarningRelay> warnings_;
   std::unique_ptr<PreviewBoard> previews_;  ///< the cameras' threads use it

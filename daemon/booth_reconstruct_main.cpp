@@ -105,6 +105,19 @@ struct Arguments {
   unsigned threads = 0;
 };
 
+void tell_health(const ProgressPipe& pipe, const std::vector<CameraHealth>& cameras) {
+  for (const CameraHealth& camera : cameras)
+    pipe.tell({{"health",
+                {{"camera", camera.camera},
+                 {"moved", camera.moved},
+                 {"offset_px", camera.offset_px},
+                 {"deviation", camera.deviation},
+                 {"light_factor", camera.light_factor},
+                 {"background_px", camera.background_px},
+                 {"background_share", camera.background_share}}}});
+  pipe.tell({{"health", nullptr}});
+}
+
 int fail(const ProgressPipe& pipe, const Error& error, int status) {
   pipe.tell({{"error", {{"kind", to_string(error.code)}, {"message", error.message}}}});
   std::cerr << "booth-reconstruct: " << error.message << "\n";
@@ -139,7 +152,8 @@ int run(const Arguments& arguments) {
       [&](std::string_view stage, double fraction) {
         if (draw) bar.draw(stage, fraction);
         pipe.tell({{"stage", stage}, {"fraction", fraction}});
-      });
+      },
+      [&](const std::vector<CameraHealth>& cameras) { tell_health(pipe, cameras); });
   bar.clear();
   if (!made) return fail(pipe, made.error(), exit_failed);
   for (const std::string& warning : made->warnings) std::cerr << "warning: " << warning << "\n";

@@ -187,8 +187,13 @@ void Operator::status() {
   const Json& calibration = status.at("calibration");
   std::cout << "calibration " << (calibration.value("loaded", false) ? "loaded" : "none");
   if (!calibration.at("rms_px").is_null()) std::cout << ", worst camera " << text_of(calibration, "rms_px") << " px";
-  std::cout << "\nbackground  " << (status.at("background").value("learned", false) ? "learned" : "not learned")
-            << "\n";
+  for (const Json& camera : calibration.value("moved", Json::array()))
+    std::cout << "; " << camera.get<std::string>() << " was moved since: calibrate anew";
+  const Json& background = status.at("background");
+  std::cout << "\nbackground  " << (background.value("learned", false) ? "learned" : "not learned");
+  if (background.contains("stale") && !background.at("stale").is_null())
+    std::cout << "; " << text_of(background, "stale") << ": learn it again";
+  std::cout << "\n";
   for (const Json& job : status.at("queue"))
     std::cout << "job         " << text_of(job, "id") << " " << text_of(job, "state") << " " << text_of(job, "stage")
               << " " << percent(job.value("fraction", 0.0)) << "\n";

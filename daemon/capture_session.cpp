@@ -549,6 +549,16 @@ Result<void> CaptureSession::write(RecordingWriter& writer, const std::string& s
 
 Result<TaskResult> CaptureSession::work(const std::string& task, const BackgroundRequest& request,
                                         const std::stop_token& cancelled) {
+  auto learned = learn(task, request, cancelled);
+  if (learned)
+    parts_.background_learned({});
+  else if (request.unattended && !cancelled.stop_requested())
+    parts_.background_learned(learned.error());
+  return learned;
+}
+
+Result<TaskResult> CaptureSession::learn(const std::string& task, const BackgroundRequest& request,
+                                         const std::stop_token& cancelled) {
   if (const auto room = parts_.check_disk(); !room) return room.error();
   const auto rig = parts_.rig();
   if (rig == nullptr) return Error{ErrorCode::not_calibrated, "the booth is not calibrated"};
@@ -572,7 +582,10 @@ Result<TaskResult> CaptureSession::work(const std::string& task, const Backgroun
     return Error{ErrorCode::not_ready,
                  "something moved in front of " + join(moved) +
                      ": the booth must be empty and its light steady; learn the background again"};
-  if (const auto warning = compare_with_last(*views)) learned.warnings.push_back(*warning);
+  if (const auto warning = compare_with_last(*views)) {
+    if (request.unattended) return Error{ErrorCode::not_ready, *warning};
+    learned.warnings.push_back(*warning);
+  }
   for (const std::string& camera : parts_.cameras.ids())
     if (!views->contains(camera)) learned.missing.push_back(camera);
   if (!learned.missing.empty())

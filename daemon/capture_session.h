@@ -40,7 +40,8 @@ struct CaptureRequest {
 
 /// The empty booth is to be learned.
 struct BackgroundRequest {
-  int frames = 10;  ///< of each camera, 1 … 100
+  int frames = 10;          ///< of each camera, 1 … 100
+  bool unattended = false;  ///< nobody says that the booth is empty: it must look as when it was learned last
 };
 
 /// One trigger is to be fired, to see which cameras answer and when.
@@ -67,6 +68,8 @@ struct CaptureParts {
   const Clock& clock;
   std::function<void(BoothState)> set_state;  ///< called without a lock held
   std::function<Result<void>()> check_disk;   ///< @error disk_full
+  /// Called when the background was learned, or could not be learned unattended.
+  std::function<void(const Result<void>&)> background_learned = [](const Result<void>&) {};
 };
 
 /// Does what needs the cameras together, one thing at a time, on a thread of its own. A capture: countdown, the body
@@ -139,6 +142,7 @@ class CaptureSession {
 
   // The tasks.
   Result<TaskResult> work(const std::string& task, const BackgroundRequest& request, const std::stop_token& cancelled);
+  Result<TaskResult> learn(const std::string& task, const BackgroundRequest& request, const std::stop_token& cancelled);
   Result<TaskResult> work(const std::string& task, const TriggerTestRequest& request, const std::stop_token& cancelled);
   Result<TaskResult> work(const std::string& task, const ProjectorCalibrationRequest& request,
                           const std::stop_token& cancelled);

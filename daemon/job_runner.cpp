@@ -27,6 +27,7 @@ using SteadyClock = std::chrono::steady_clock;
 constexpr std::chrono::milliseconds step{50};            ///< how soon a cancelled job's process is killed
 constexpr std::chrono::milliseconds publish_pause{100};  ///< between two progress events of a job
 constexpr size_t longest_line = 4096;                    ///< of the progress protocol; more is not ours
+constexpr size_t most_cameras = 1024;                    ///< of which a process may tell the health
 constexpr size_t longest_output = 8192;                  ///< of the process's own words that are kept: the last ones
 
 /// Splits what comes through a pipe into lines; one that is too long is dropped.
@@ -89,6 +90,22 @@ std::string text_of(const Json& object, const char* key, const char* otherwise) 
   return found != object.end() && found->is_string() ? found->get<std::string>() : otherwise;
 }
 
+double number_of(const Json& object, const char* key, double otherwise) {
+  const auto found = object.find(key);
+  return found != object.end() && found->is_number() ? found->get<double>() : otherwise;
+}
+
+CameraHealth health_of(const Json& object) {
+  const auto moved = object.find("moved");
+  return {.camera = text_of(object, "camera", ""),
+          .moved = moved != object.end() && moved->is_boolean() && moved->get<bool>(),
+          .offset_px = number_of(object, "offset_px", 0),
+          .deviation = number_of(object, "deviation", 0),
+          .light_factor = number_of(object, "light_factor", 1),
+          .background_px = number_of(object, "background_px", 0),
+          .background_share = number_of(object, "background_share", 1)};
+}
+
 std::string describe_end(int status, const std::string& last_words) {
   std::string text = WIFSIGNALED(status) ? "was killed by signal " + std::to_string(WTERMSIG(status))
                                          : "ended with status " + std::to_string(WEXITSTATUS(status));
@@ -107,12 +124,14 @@ struct JobRunner::Run {
   Tail output;
 };
 
-JobRunner::JobRunner(JobRunnerOptions options, JobQueue& jobs, AvatarStore& avatars, EventBus& events, Metrics& metrics)
+JobRunner::JobRunner(JobRunnerOptions options, JobQueue& jobs, AvatarStore& avatars, EventBus& events, Metrics& metrics,
+                     OnHealth on_health)
     : options_(std::move(options)),
       jobs_(jobs),
       avatars_(avatars),
       events_(events),
       metrics_(metrics),
+      on_health_(std::move(on_health)),
       pulses_(static_cast<size_t>(std::max(1, options_.workers))) {
   for (Pulse& pulse : pulses_) {
     workers_.emplace_back([this, &pulse](const std::stop_token& stop) { work(stop, pulse); });
@@ -183,11 +202,18 @@ void JobRunner::run(const JobQueue::Lease& lease, const std::stop_token& stop, P
 
     auto last_published = SteadyClock::time_point::min();
     LineReader lines;
+    std::vector<CameraHealth> cameras;
     const auto on_line = [&](const std::string& line) {
       const Json json = Json::parse(line, nullptr, false);
       if (!json.is_object()) return;
       if (const auto error = json.find("error"); error != json.end() && error->is_object()) {
         run.error = Reason{text_of(*error, "kind", "internal"), text_of(*error, "message", "it did not say why")};
+      } else if (const auto health = json.find("health"); health != json.end()) {
+        if (health->is_object()) {
+          if (cameras.size() < most_cameras) cameras.push_back(health_of(*health));
+        } else if (on_health_) {
+          on_health_(id, std::exchange(cameras, {}));
+        }
       } else if (const auto stage = json.find("stage"), fraction = json.find("fraction");
                  stage != json.end() && stage->is_string() && fraction != json.end() && fraction->is_number()) {
         const auto now = SteadyClock::now();

@@ -3,6 +3,7 @@
 #include <atomic>
 #include <chrono>
 #include <filesystem>
+#include <functional>
 #include <string>
 #include <thread>
 #include <vector>
@@ -12,6 +13,7 @@
 #include "daemon/job_queue.h"
 #include "daemon/metrics.h"
 #include "daemon/pulse.h"
+#include "pipeline/types/camera_health.h"
 
 namespace booth {
 
@@ -25,14 +27,19 @@ struct JobRunnerOptions {
   int retries = 1;  ///< of a job whose process died
 };
 
+/// What a job's process found out about the booth's cameras. Called by workers, several at a time.
+using OnHealth = std::function<void(const std::string& capture, const std::vector<CameraHealth>& cameras)>;
+
 /// Takes jobs from the queue and runs each in a process of its own, so that no input can take the daemon down.
 ///
 /// The process says on descriptor 3, one JSON object a line, how far it is: {"stage": "hull", "fraction": 0.42}, the
-/// fraction that of the whole job; and why it failed: {"error": {"kind": "no_subject", "message": "…"}}. It ends with
-/// status 0 after the avatar's folder has appeared by a rename.
+/// fraction that of the whole job; what it found out about each camera and, when that is all, null:
+/// {"health": {"camera": "body-00", "moved": true, …}}; and why it failed: {"error": {"kind": "no_subject", "message":
+/// "…"}}. It ends with status 0 after the avatar's folder has appeared by a rename.
 class JobRunner {
  public:
-  JobRunner(JobRunnerOptions options, JobQueue& jobs, AvatarStore& avatars, EventBus& events, Metrics& metrics);
+  JobRunner(JobRunnerOptions options, JobQueue& jobs, AvatarStore& avatars, EventBus& events, Metrics& metrics,
+            OnHealth on_health = {});
   ~JobRunner();
 
   /// Kills what runs; those jobs go back into the queue. Waits for that.
@@ -54,6 +61,7 @@ class JobRunner {
   AvatarStore& avatars_;
   EventBus& events_;
   Metrics& metrics_;
+  const OnHealth on_health_;
   std::vector<Pulse> pulses_;  ///< one a worker
   std::vector<std::jthread> workers_;
 };

@@ -39,6 +39,6 @@ struct JobReport {
 Result<JobReport> reconstruct_recording(const std::filesystem::path& recording, const std::filesystem::path& avatar,
                                         const ReconstructionOptions& options, const FaceModelSource& face_model,
                                         const AvatarFileOptions& files, const Work& work,
-                                        const JobProgress& progress = {});
+                                        const JobProgress& progress = {}, const HealthReport& health = {});
 
 }  // namespace booth

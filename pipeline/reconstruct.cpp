@@ -52,6 +52,7 @@ class StageReport {
 struct SegmentedViews {
   std::vector<Silhouette> silhouettes;
   std::vector<std::string> warnings;
+  std::vector<CameraHealth> health;  ///< in the order of the silhouettes
 };
 
 /// The frames of the empty booth that a camera took, in the order of their repetitions.
@@ -122,11 +123,29 @@ Result<SegmentedViews> segment_all(const CaptureFrames& capture, std::span<const
       continue;
     }
     views.silhouettes.push_back(std::move(result->silhouette));
+    views.health.push_back({.camera = frames[i].camera,
+                            .light_factor = result->light_factor,
+                            .background_px = result->movement_px,
+                            .background_share = result->background_share});
     views.warnings.insert(views.warnings.end(), result->warnings.begin(), result->warnings.end());
   }
   if (views.silhouettes.empty())
     return first_error.value_or(Error{ErrorCode::too_few_views, "the capture holds no usable body image"});
   return views;
+}
+
+/// Tells what segmentation and, where there is one, the hull found out about the cameras.
+void tell_health(std::vector<CameraHealth> cameras, const std::vector<CameraAgreement>& agreement,
+                 const HealthReport& health) {
+  if (!health) return;
+  for (CameraHealth& camera : cameras)
+    for (const CameraAgreement& found : agreement)
+      if (found.camera == camera.camera) {
+        camera.moved = found.moved;
+        camera.offset_px = found.offset_px;
+        camera.deviation = found.deviation;
+      }
+  health(cameras);
 }
 
 /// What a face was fitted from and to.
@@ -295,11 +314,12 @@ const std::vector<std::string>& reconstruction_stages() {
 }
 
 Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options,
-                                   const FaceModelSource& face_model, const Work& work, const StageProgress& progress) {
+                                   const FaceModelSource& face_model, const Work& work, const StageProgress& progress,
+                                   const HealthReport& health) {
   if (is_raw(capture.body) || std::any_of(capture.background.begin(), capture.background.end(), is_raw) ||
       (capture.face && std::any_of(capture.face->sets.begin(), capture.face->sets.end(), is_raw))) {
     const auto developed = develop_all(capture, work);
-    return developed ? reconstruct(*developed, options, face_model, work, progress) : developed.error();
+    return developed ? reconstruct(*developed, options, face_model, work, progress, health) : developed.error();
   }
   if (const auto checked = check(capture.rig); !checked) return checked.error();
   Reconstruction result;
@@ -321,6 +341,7 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
   {
     const StageReport report("hull", work, progress);
     auto carved = carve_visual_hull(capture.rig, views.silhouettes, options.hull, report.work());
+    tell_health(views.health, carved ? carved->agreement : std::vector<CameraAgreement>(), health);
     if (!carved) return carved.error();
     hull = std::move(*carved);
     result.cameras = std::move(hull.cameras);

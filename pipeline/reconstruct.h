@@ -23,6 +23,7 @@
 #include "pipeline/surface/decimation.h"
 #include "pipeline/surface/smoothing.h"
 #include "pipeline/types/avatar.h"
+#include "pipeline/types/camera_health.h"
 #include "pipeline/types/frame.h"
 #include "pipeline/types/rig.h"
 #include "pipeline/types/work.h"
@@ -89,6 +90,9 @@ const std::vector<std::string>& reconstruction_stages();
 /// Called when a stage begins (fraction 0), while it runs, and when it ends (1).
 using StageProgress = std::function<void(std::string_view stage, double fraction)>;
 
+/// Called once, when it is known what the capture says about the cameras: by id.
+using HealthReport = std::function<void(const std::vector<CameraHealth>& cameras)>;
+
 /// The whole method: segment → hull → refine → face → surface → atlas → skeleton → skin.
 ///
 /// @param face_model  for the passive face; left out, there is none
@@ -100,6 +104,6 @@ using StageProgress = std::function<void(std::string_view stage, double fraction
 /// @error what the stages return, cancelled
 Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options,
                                    const FaceModelSource& face_model = {}, const Work& work = {},
-                                   const StageProgress& progress = {});
+                                   const StageProgress& progress = {}, const HealthReport& health = {});
 
 }  // namespace booth

@@ -154,26 +154,29 @@ Answer Dispatcher::status() const {
   const BoothStatus status = booth_.status();
   Json cameras = Json::array();
   for (const CameraStatus& camera : status.cameras) cameras.push_back(to_json(camera));
-  return Reply{
-      {{"state", to_string(status.state)},
-       {"state_since", iso8601(status.state_since, true)},
-       {"boot", status.boot},
-       {"sequence", status.sequence},
-       {"ready", status.not_ready.empty()},
-       {"not_ready", api::to_json(status.not_ready)},
-       {"capture", status.capture ? Json(*status.capture) : Json(nullptr)},
-       {"tasks", to_json(status.tasks)},
-       {"cameras", cameras},
-       {"projector", to_json(status.projector, "id")},
-       {"trigger", to_json(status.trigger, "driver")},
-       {"calibration",
-        {{"loaded", status.calibration.loaded},
-         {"rms_px", status.calibration.rms_px ? Json(*status.calibration.rms_px) : Json(nullptr)},
-         {"created", text_or_null(status.calibration.created)}}},
-       {"background", {{"learned", status.background.learned}, {"created", text_or_null(status.background.created)}}},
-       {"queue", to_json(status.queue)},
-       {"disk", {{"free_bytes", status.disk.free_bytes}, {"limit_bytes", status.disk.limit_bytes}}},
-       {"uptime_s", status.uptime_s}}};
+  return Reply{{{"state", to_string(status.state)},
+                {"state_since", iso8601(status.state_since, true)},
+                {"boot", status.boot},
+                {"sequence", status.sequence},
+                {"ready", status.not_ready.empty()},
+                {"not_ready", api::to_json(status.not_ready)},
+                {"capture", status.capture ? Json(*status.capture) : Json(nullptr)},
+                {"tasks", to_json(status.tasks)},
+                {"cameras", cameras},
+                {"projector", to_json(status.projector, "id")},
+                {"trigger", to_json(status.trigger, "driver")},
+                {"calibration",
+                 {{"loaded", status.calibration.loaded},
+                  {"rms_px", status.calibration.rms_px ? Json(*status.calibration.rms_px) : Json(nullptr)},
+                  {"created", text_or_null(status.calibration.created)},
+                  {"moved", status.calibration.moved}}},
+                {"background",
+                 {{"learned", status.background.learned},
+                  {"created", text_or_null(status.background.created)},
+                  {"stale", text_or_null(status.background.stale.value_or(""))}}},
+                {"queue", to_json(status.queue)},
+                {"disk", {{"free_bytes", status.disk.free_bytes}, {"limit_bytes", status.disk.limit_bytes}}},
+                {"uptime_s", status.uptime_s}}};
 }
 
 Answer Dispatcher::metrics() const { return Reply{booth_.measurements()}; }

@@ -130,18 +130,6 @@ PoseChange PoseEstimation::change(const PoseSolution& solution, size_t camera) c
   return solution.px.segment<6>(static_cast<Eigen::Index>(6 * camera)).cwiseQuotient(cameras_[camera].px);
 }
 
-double PoseEstimation::misfit(const Eigen::VectorXd& px) const {
-  const Eigen::VectorXd misses = residuals(px);
-  double squares = 0, weights = 0;
-  for (size_t n = 0; n < samples_.size(); ++n) {
-    const double miss = misses[static_cast<Eigen::Index>(n)];
-    const double touching = pull_of(miss, 2 * noise, surplus_[samples_[n].slopes[0].view]).touching;
-    squares += touching * miss * miss;
-    weights += touching;
-  }
-  return weights > 0 ? std::sqrt(squares / weights) : 0;
-}
-
 std::vector<PoseScale> pose_scales(std::span<const CalibratedView* const> cameras, const Eigen::Vector3d& center,
                                    std::span<const CoherenceSample> samples) {
   std::vector<std::vector<double>> noises(cameras.size());

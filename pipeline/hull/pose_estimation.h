@@ -42,10 +42,6 @@ class PoseEstimation {
   /// In physical units. @return the change of a camera's pose that the solution asks for
   PoseChange change(const PoseSolution& solution, size_t camera) const;
 
-  /// How much better the misses are explained: root mean square of the samples that touch, pixels of noise, before
-  /// (no change) and after.
-  double misfit(const Eigen::VectorXd& px) const;
-
  private:
   Eigen::VectorXd residuals(const Eigen::VectorXd& px) const;
 

@@ -104,26 +104,29 @@ double border_share(const Image& coverage) {
   return static_cast<double>(covered) / (2.0 * (coverage.width + coverage.height));
 }
 
+/// The channel's that changed most, at least 1.
+double light_factor(const Residual& residual) {
+  double drift = 1;
+  for (int c = 0; c < residual.difference.channels; ++c)
+    drift = std::max<double>(drift, std::exp(segmentation::srgb_exponent * std::abs(residual.mean_drift[c])));
+  return drift;
+}
+
 std::vector<std::string> find_warnings(const Residual& residual, const Labeling& labeling, const Segmentation& result,
                                        const std::string& camera) {
   std::vector<std::string> warnings;
   const auto warn = [&](const std::string& what) { warnings.push_back("camera " + camera + ": " + what); };
-  double drift = 1;
-  for (int c = 0; c < residual.difference.channels; ++c) {
-    const double factor = std::exp(segmentation::srgb_exponent * std::abs(residual.mean_drift[c]));
-    drift = std::max(drift, factor);
-  }
-  if (drift > much_drift) {
+  if (result.light_factor > much_drift) {
     std::ostringstream text;
     text.precision(2);
-    text << "the light changed by a factor of " << drift << " since the background was captured";
+    text << "the light changed by a factor of " << result.light_factor << " since the background was captured";
     warn(text.str());
   }
-  const float movement_px = std::hypot(residual.movement_px[0], residual.movement_px[1]);
-  if (movement_px > much_movement_px) {
+  if (result.movement_px > much_movement_px) {
     std::ostringstream text;
     text.precision(2);
-    text << "the camera moved by " << movement_px << " pixels since the background was captured; calibrate it anew";
+    text << "the camera moved by " << result.movement_px
+         << " pixels since the background was captured; calibrate it anew";
     warn(text.str());
   }
   if (residual.drift_support < little_agreement) warn("little of the image still looks like the background");
@@ -169,6 +172,9 @@ Result<Segmentation> segment(std::span<const Frame> background, const Frame& bod
   result.silhouette.camera = body.camera;
   result.silhouette.coverage = segmentation::matte(background, *body.pixels, model, residual, labeling.subject);
   result.subject_share = covered_share(result.silhouette.coverage);
+  result.light_factor = light_factor(residual);
+  result.movement_px = std::hypot(residual.movement_px[0], residual.movement_px[1]);
+  result.background_share = residual.drift_support;
   result.warnings = find_warnings(residual, labeling, result, body.camera);
   work.report(1);
   return result;

@@ -27,6 +27,9 @@ struct SegmentationOptions {
 struct Segmentation {
   Silhouette silhouette;
   double subject_share = 0;           ///< of the image's area, 0 … 1
+  double light_factor = 1;            ///< how many times brighter or darker the place became since the background
+  double movement_px = 0;             ///< of the picture since the background
+  double background_share = 1;        ///< of the image, that looks like the background under that light, 0 … 1
   std::vector<std::string> warnings;  ///< what an operator should know, naming the camera
 };
 

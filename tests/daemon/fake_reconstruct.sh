@@ -20,6 +20,16 @@ case $(cat "$here/behaviour") in
     say '{"stage": "export", "fraction": 0.5}'
     publish
     ;;
+  good_health | moved | dark)
+    for camera in b0 b1 b2 b3; do
+      moved=false light=1.02
+      [ "$(cat "$here/behaviour")$camera" = movedb2 ] && moved=true
+      [ "$(cat "$here/behaviour")" = dark ] && light=1.9
+      say "{\"health\": {\"camera\": \"$camera\", \"moved\": $moved, \"offset_px\": 3.14, \"light_factor\": $light}}"
+    done
+    say '{"health": null}'
+    publish
+    ;;
   fail)
     say '{"error": {"kind": "no_subject", "message": "nobody is in the pictures"}}'
     exit 1

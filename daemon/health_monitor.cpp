@@ -1,0 +1,102 @@
+#include "daemon/health_monitor.h"
+
+#include <algorithm>
+#include <sstream>
+
+namespace booth {
+namespace {
+
+/// Of the cameras, that have to see another light: one alone is dazzled, or looks at a lamp.
+constexpr double telling_share = 0.5;
+
+std::string drift_message(const CameraHealth& camera) {
+  std::ostringstream text;
+  text.precision(2);
+  text << "camera " << camera.camera << " no longer stands where it was calibrated: its picture is off by "
+       << camera.offset_px << " pixels from where the other cameras expect it. Fasten it and calibrate the booth anew";
+  return text.str();
+}
+
+}  // namespace
+
+void HealthMonitor::report(const std::string& capture, const std::vector<CameraHealth>& cameras) {
+  std::vector<Alert> alerts;
+  {
+    const std::lock_guard lock(mutex_);
+    cameras_ = cameras;
+    for (const CameraHealth& camera : cameras)
+      if (camera.moved)
+        alerts.push_back(
+            {Severity::warning, "calibration_drift", drift_message(camera) + " (capture " + capture + ")"});
+    std::vector<double> factors;
+    for (const CameraHealth& camera : cameras) factors.push_back(camera.light_factor);
+    const auto other_light =
+        std::count_if(factors.begin(), factors.end(), [&](double factor) { return factor > config_.max_light_factor; });
+    const bool was_known = light_.has_value();
+    light_.reset();
+    if (!factors.empty() && static_cast<double>(other_light) >= telling_share * static_cast<double>(factors.size())) {
+      std::ostringstream text;
+      text.precision(2);
+      text << "the light has changed by a factor of up to " << *std::max_element(factors.begin(), factors.end())
+           << " for " << other_light << " of " << factors.size() << " cameras";
+      light_ = text.str();
+      if (!was_known)
+        alerts.push_back({Severity::warning, "background_stale",
+                          *light_ + " since the background was learned: learn it again with nobody in the booth"});
+    }
+  }
+  for (Alert& alert : alerts) events_.publish(std::move(alert));
+}
+
+std::vector<CameraHealth> HealthMonitor::cameras() const {
+  const std::lock_guard lock(mutex_);
+  return cameras_;
+}
+
+std::vector<std::string> HealthMonitor::moved() const {
+  const std::lock_guard lock(mutex_);
+  std::vector<std::string> ids;
+  for (const CameraHealth& camera : cameras_)
+    if (camera.moved) ids.push_back(camera.camera);
+  return ids;
+}
+
+void HealthMonitor::calibrated() {
+  const std::lock_guard lock(mutex_);
+  for (CameraHealth& camera : cameras_) {
+    camera.moved = false;
+    camera.offset_px = camera.deviation = 0;
+  }
+}
+
+void HealthMonitor::background_learned() {
+  const std::lock_guard lock(mutex_);
+  light_.reset();
+  asked_ = false;
+  for (CameraHealth& camera : cameras_) {
+    camera.light_factor = camera.background_share = 1;
+    camera.background_px = 0;
+  }
+}
+
+std::optional<std::string> HealthMonitor::staleness(std::optional<std::chrono::seconds> age) const {
+  {
+    const std::lock_guard lock(mutex_);
+    if (light_) return *light_ + " since the background was learned";
+  }
+  if (config_.max_age_h == 0 || !age || *age < std::chrono::hours(config_.max_age_h)) return std::nullopt;
+  return "the background was learned " + std::to_string(std::chrono::floor<std::chrono::hours>(*age).count()) +
+         " hours ago";
+}
+
+void HealthMonitor::ask_for_background(const std::string& why) {
+  {
+    const std::lock_guard lock(mutex_);
+    if (asked_) return;
+    asked_ = true;
+  }
+  events_.publish(Alert{Severity::warning, "background_stale",
+                        why + ": empty the booth and learn its background (boothctl background learn)"});
+}
+
+}  // namespace booth
