@@ -313,7 +313,8 @@ TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
       triangles = 9999999999999
       )"),
       testing::UnorderedElementsAre(
-          "colour: \"red\", expected one of the keys booth, api, capture, background, disk, jobs, log, cameras, trigger, "
+          "colour: \"red\", expected one of the keys booth, api, capture, background, disk, jobs, log, cameras, "
+          "trigger, "
           "projector, replay, "
           "face, reconstruct, export",
           "log: 3, expected a table: [log]", "booth.name: \"\", expected a text of 1 … 64 bytes on one line",
