@@ -338,6 +338,12 @@ void visit_reconstruct(Visitor& visitor, ReconstructionOptions& options) {
   visitor.number("face_share", options.face_share, 0, 0.9);
   visitor.integer("triangles", options.decimation.triangles, 500, 1'000'000);
   visitor.integer("atlas_size", options.atlas.size, 256, 8192);
+  Words<TextureMethod> methods;
+  for (const TextureMethod method : {TextureMethod::best_view, TextureMethod::blend, TextureMethod::full})
+    methods.emplace_back(to_string(method), method);
+  visitor.choice("texture_method", options.atlas.method, methods);
+  visitor.choice("texture_charts", options.atlas.charting,
+                 Words<Charting>{{"flattening", Charting::flattening}, {"unfolding", Charting::unfolding}});
   visitor.millimetres("voxel_mm", options.hull.voxel_m, 1, 50);
   visitor.integer("min_views", options.hull.min_views, 1, 256);
   visitor.choice("skeleton", options.skeleton.method,

@@ -99,7 +99,7 @@ class StopOnSignal {
 };
 
 struct Arguments {
-  std::string recording, avatar, config, face;
+  std::string recording, avatar, config, face, texture;
   bool timings = false;
   int progress_fd = -1;
   unsigned threads = 0;
@@ -134,6 +134,7 @@ int run(const Arguments& arguments) {
   }
   ReconstructionOptions options = config.reconstruct;
   if (!arguments.face.empty()) options.face = *face_mode_from(arguments.face);
+  if (!arguments.texture.empty()) options.atlas.method = *texture_method_from(arguments.texture);
 
   const StopOnSignal stop;
   ThreadPool pool(arguments.threads);
@@ -186,6 +187,8 @@ int main(int argc, char** argv) {
   app.add_option("OUT_DIR", arguments.avatar, "where the avatar's folder will appear")->required();
   app.add_option("--face", arguments.face, "how the face is made")
       ->check(CLI::IsMember({"active", "passive", "none", "auto"}));
+  app.add_option("--texture", arguments.texture, "how the photographs become one texture")
+      ->check(CLI::IsMember({"full", "blend", "best_view"}));
   app.add_option("--config", arguments.config, "the booth's configuration file");
   app.add_flag("--timings", arguments.timings, "print the seconds of each stage as JSON");
   app.add_option("--threads", arguments.threads, "how many to use; 0 for as many as there are processors")

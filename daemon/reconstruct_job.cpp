@@ -173,6 +173,7 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   metadata.recording = recording->id;
   metadata.cameras = std::move(made->cameras);
   metadata.face = to_string(made->face);
+  metadata.texture_method = to_string(options.atlas.method);
   metadata.warnings = report.warnings;
   metadata.stage_seconds = clock.finish();
   clock.tell("export", 0);

@@ -266,6 +266,13 @@ Mesh make_surface(const Field& field, const FaceSurface* face, const Reconstruct
   return decimate(merged->mesh, merged->face, options.face_share, options.decimation, work);
 }
 
+/// One a vertex: 1 in the box, which a scan made more exact than photographs can.
+std::vector<uint8_t> inside(const Eigen::AlignedBox3d& box, const Mesh& mesh) {
+  std::vector<uint8_t> in_box;
+  for (const Eigen::Vector3f& p : mesh.positions) in_box.push_back(box.contains(p.cast<double>()) ? 1 : 0);
+  return in_box;
+}
+
 /// Skeleton and weights, or an avatar left unrigged with a warning: a shape that cannot be rigged is still worth
 /// having.
 Result<void> rig_avatar(Avatar* avatar, const ReconstructionOptions& options, const Work& work,
@@ -386,9 +393,11 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
 
   {
     const StageReport report("atlas", work, progress);
-    auto textured =
-        build_texture_atlas(avatar.mesh, *hull.rig, frames, views.silhouettes, options.atlas, report.work());
+    auto textured = build_texture_atlas(avatar.mesh, *hull.rig, frames, views.silhouettes, options.atlas, report.work(),
+                                        face ? inside(face->head.box(), avatar.mesh) : std::vector<uint8_t>{});
     if (!textured) return textured.error();
+    avatar.mesh.positions = std::move(textured->positions);
+    remove_self_intersections(&avatar.mesh, report.work());
     avatar.atlas = std::move(textured->atlas);
     warnings.insert(warnings.end(), textured->warnings.begin(), textured->warnings.end());
   }

@@ -7,6 +7,7 @@
 #include "pipeline/atlas/camera_ratings.h"
 #include "pipeline/atlas/input_preparation.h"
 #include "pipeline/types/mesh.h"
+#include "pipeline/types/work.h"
 
 namespace booth {
 
@@ -22,5 +23,8 @@ namespace booth {
 /// @param mesh  world frame, metres; its vertices are those that the views hold projected and the ratings rate
 std::vector<Eigen::Array3f> balance_colours(const Mesh& mesh, std::span<const PreparedView> views,
                                             const CameraRatings& ratings);
+
+/// Multiplies every view's colours by its factors.
+void apply_gains(std::span<PreparedView> views, std::span<const Eigen::Array3f> gains, const Work& work = {});
 
 }  // namespace booth

@@ -1,12 +1,14 @@
 #include "pipeline/atlas/input_preparation.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <opencv2/core.hpp>
 #include <opencv2/photo.hpp>
 #include <utility>
 
+#include "pipeline/atlas/linear_light.h"
 #include "pipeline/geometry/camera_model.h"
 
 namespace booth {
@@ -60,17 +62,21 @@ Image cropped_colours(const Image& pixels, const Box& box) {
   return crop;
 }
 
-/// At half resolution: 255 where all pixels under and around show the subject alone, which erodes the silhouette
-/// by two to three pixels.
-Image eroded_inside(const Image& coverage, const Box& box) {
+/// At half resolution: 255 where all pixels under one show the subject alone.
+Image fully_inside(const Image& coverage, const Box& box) {
   const int width = (box.right - box.left + 1) / 2, height = (box.bottom - box.top + 1) / 2;
   Image covered(width, height, 1, 255);
   for (int y = box.top; y < box.bottom; ++y)
     for (int x = box.left; x < box.right; ++x)
       if (coverage.at(x, y) < fully_covered) covered.at((x - box.left) / 2, (y - box.top) / 2) = 0;
-  Image inside(width, height, 1);
-  for (int y = 1; y + 1 < height; ++y)
-    for (int x = 1; x + 1 < width; ++x) {
+  return covered;
+}
+
+/// 255 where all pixels under and around do, which erodes the silhouette by two to three pixels.
+Image eroded(const Image& covered) {
+  Image inside(covered.width, covered.height, 1);
+  for (int y = 1; y + 1 < inside.height; ++y)
+    for (int x = 1; x + 1 < inside.width; ++x) {
       uint8_t all = 255;
       for (int v = y - 1; v <= y + 1; ++v)
         for (int u = x - 1; u <= x + 1; ++u) all = static_cast<uint8_t>(all & covered.at(u, v));
@@ -178,6 +184,20 @@ void inpaint_rim(Image& colours, Image& valid) {
   grown.copyTo(known);
 }
 
+LightPyramid linear_light(const Pyramid& pyramid) {
+  std::array<uint16_t, 256> table{};
+  for (size_t i = 0; i < table.size(); ++i)
+    table[i] = static_cast<uint16_t>(std::lround(full_light * linear_light_of_srgb[i]));
+  LightPyramid light;
+  for (const Image& level : pyramid) {
+    LightImage& linear = light.emplace_back(level.width, level.height, 4);
+    const size_t pixels = level.samples.size() / 3;
+    for (size_t i = 0; i < pixels; ++i)
+      for (size_t c = 0; c < 3; ++c) linear.samples[4 * i + c] = table[level.samples[3 * i + c]];
+  }
+  return light;
+}
+
 double median_depth(const FloatImage& depth) {
   std::vector<float> covered;
   std::copy_if(depth.samples.begin(), depth.samples.end(), std::back_inserter(covered),
@@ -197,7 +217,11 @@ PreparedView prepare_view(const Mesh& mesh, const RigCamera& camera, const Frame
   view.left = box.left;
   view.top = box.top;
   view.projected = project_vertices(mesh, camera, box.left, box.top);
-  const Image inside = eroded_inside(silhouette.coverage, box);
+  const Image covered = fully_inside(silhouette.coverage, box);
+  const Image inside = eroded(covered);
+  Image outside = covered;
+  for (uint8_t& sample : outside.samples) sample = static_cast<uint8_t>(255 - sample);
+  view.margin = chamfer_distance(outside);
   view.depth = depth_map(mesh, view.projected, inside.width, inside.height);
   const double half_resolution_px_per_m = 0.5 * camera.intrinsics.fx / median_depth(view.depth);
   view.confidence = confidence_map(inside, view.depth, std::max(2.0, rim_m * half_resolution_px_per_m));
@@ -207,8 +231,12 @@ PreparedView prepare_view(const Mesh& mesh, const RigCamera& camera, const Frame
   for (int y = 0; y < valid.height; ++y)
     for (int x = 0; x < valid.width; ++x) valid.at(x, y) = inside.at(x / 2, y / 2);
   if (inpainting == Inpainting::telea) inpaint_rim(colours, valid);
-  view.colours = push_pull(std::move(colours), valid);
+  view.colours = linear_light(push_pull(std::move(colours), valid));
   return view;
+}
+
+void project_again(const Mesh& mesh, PreparedView* view) {
+  view->projected = project_vertices(mesh, *view->camera, view->left, view->top);
 }
 
 }  // namespace booth

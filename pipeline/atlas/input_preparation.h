@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <cstdint>
 #include <vector>
 
 #include "pipeline/atlas/push_pull.h"
@@ -18,21 +19,32 @@ enum class Inpainting {
   telea       ///< A. Telea, "An image inpainting technique based on the fast marching method", JGT 9(1), 2004
 };
 
+/// Linear light in 16 bits: red, green, blue and one that is not used, so that a pixel fills a register.
+using LightImage = Raster<uint16_t>;
+/// The brightest that a camera delivers; the other half of the range is room for gains.
+constexpr float full_light = 32767;
+/// As Pyramid.
+using LightPyramid = std::vector<LightImage>;
+
 /// What texturing needs of one camera, cropped to the subject. Pixel coordinates are relative to the crop.
 struct PreparedView {
   const RigCamera* camera = nullptr;
   /// Of each vertex: pixel x and y, and the depth along the optical axis in metres; a depth of 0 says that the
   /// camera cannot see it (behind it, or too far off the axis).
   std::vector<Eigen::Vector3f> projected;
-  Pyramid colours;        ///< sRGB; the rim and the outside of the subject hold colours of its inside
-  FloatImage depth;       ///< metres to the first surface, at half the resolution (level 1 of the pyramid); huge = none
-  Image confidence;       ///< like `depth`: 255 well inside, falling to 0 at outlines, depth steps and image borders
-  int left = 0, top = 0;  ///< of the crop in the image
+  LightPyramid colours;  ///< the rim and the outside of the subject hold colours of its inside
+  FloatImage depth;      ///< metres to the first surface, at half the resolution (level 1 of the pyramid); huge = none
+  Image confidence;      ///< like `depth`: 255 well inside, falling to 0 at outlines, depth steps and image borders
+  Raster<uint16_t> margin;  ///< like `depth`: how far the silhouette's outline is, thirds of a pixel of this map
+  int left = 0, top = 0;    ///< of the crop in the image
 };
 
 /// @param frame  grey or RGB, the size of the camera's image; so is the silhouette
 /// @param rim_m  how far from outlines and depth steps colours are not trusted, for the error of the surface
 PreparedView prepare_view(const Mesh& mesh, const RigCamera& camera, const Frame& frame, const Silhouette& silhouette,
                           double rim_m, Inpainting inpainting);
+
+/// Follows vertices that were moved by little: where they are in the image, not what is seen there.
+void project_again(const Mesh& mesh, PreparedView* view);
 
 }  // namespace booth

@@ -2,13 +2,18 @@
 
 #include <Eigen/Geometry>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <utility>
 
+#include "pipeline/atlas/blending.h"
 #include "pipeline/atlas/camera_ratings.h"
 #include "pipeline/atlas/colour_balance.h"
+#include "pipeline/atlas/occluder.h"
 #include "pipeline/atlas/packing.h"
 #include "pipeline/atlas/push_pull.h"
+#include "pipeline/atlas/reference_texturing.h"
+#include "pipeline/atlas/surface_offset.h"
 
 namespace booth {
 namespace {
@@ -28,7 +33,8 @@ bool fits(const Image* image, const Intrinsics& k) {
   return image != nullptr && image->width == k.width && image->height == k.height;
 }
 
-/// The cameras that have a usable frame and a silhouette, in the rig's order; a sentence for each that has not.
+/// The cameras that have a usable frame and a silhouette, in the order of their ids, so that no sum depends on the
+/// rig's order; a sentence for each that has not.
 std::vector<Source> usable_sources(const Rig& rig, std::span<const Frame> frames,
                                    std::span<const Silhouette> silhouettes, std::vector<std::string>& warnings) {
   std::vector<Source> sources;
@@ -45,6 +51,8 @@ std::vector<Source> usable_sources(const Rig& rig, std::span<const Frame> frames
     }
     sources.push_back({&camera, &*frame, &*silhouette});
   }
+  std::sort(sources.begin(), sources.end(),
+            [](const Source& l, const Source& r) { return l.camera->id < r.camera->id; });
   return sources;
 }
 
@@ -59,7 +67,8 @@ double seen_share(const Mesh& mesh, const CameraRatings& ratings) {
   for (size_t t = 0; t < mesh.triangles.size(); ++t) {
     const double area = triangle_area(mesh, t);
     total += area;
-    if (ratings.triangle_seen[t] != 0) seen += area;
+    const auto rating = ratings.triangle(t);
+    if (std::any_of(rating.begin(), rating.end(), [](float r) { return r > 0; })) seen += area;
   }
   return total > 0 ? seen / total : 0;
 }
@@ -102,38 +111,90 @@ std::vector<std::array<Eigen::Vector2f, 3>> texture_coordinates(const Packing& p
   return uv;
 }
 
+/// What the product's method does before anything is painted: balances the colours and lays the surface where the
+/// cameras agree on it.
+void prepare_fully(Mesh* mesh, std::span<PreparedView> views, const CameraRatings& ratings,
+                   std::span<const uint8_t> exact, const AtlasOptions& options, const Work& work) {
+  if (options.balance_colours) apply_gains(views, balance_colours(*mesh, views, ratings), work);
+  if (!options.align_surface) return;
+  std::vector<float> limits = offset_limits(*mesh, views);
+  for (size_t v = 0; v < exact.size(); ++v)
+    if (exact[v] != 0) limits[v] = 0;
+  const std::vector<float> weights = weigh_views(*mesh, views, ratings);
+  const std::vector<float> offsets = find_surface_offsets(*mesh, views, ratings, weights, limits, work);
+  const std::vector<Eigen::Vector3f> normals = vertex_normals(*mesh);
+  for (size_t v = 0; v < offsets.size(); ++v) mesh->positions[v] += offsets[v] * normals[v];
+  for (PreparedView& view : views) project_again(*mesh, &view);
+}
+
+TexelColours paint(const Mesh& mesh, const Packing& packing, std::span<const PreparedView> views,
+                   const CameraRatings& ratings, const Occluder& occluder, const AtlasOptions& options,
+                   const Work& work) {
+  switch (options.method) {
+    case TextureMethod::best_view: return paint_best_views(mesh, packing, options.size, views, ratings, work);
+    case TextureMethod::blend: return paint_rating_means(mesh, packing, options.size, views, ratings, occluder, work);
+    case TextureMethod::full: break;
+  }
+  return blend_texels(mesh, packing, options.size, views, ratings, weigh_views(mesh, views, ratings), work);
+}
+
+constexpr std::array<std::pair<TextureMethod, std::string_view>, 3> method_names{
+    {{TextureMethod::best_view, "best_view"}, {TextureMethod::blend, "blend"}, {TextureMethod::full, "full"}}};
+
 }  // namespace
 
-Result<TextureAtlas> build_texture_atlas(const Mesh& mesh, const Rig& rig, std::span<const Frame> frames,
+std::string_view to_string(TextureMethod method) {
+  const auto found =
+      std::find_if(method_names.begin(), method_names.end(), [&](const auto& entry) { return entry.first == method; });
+  return found->second;
+}
+
+std::optional<TextureMethod> texture_method_from(std::string_view name) {
+  for (const auto& [method, word] : method_names)
+    if (word == name) return method;
+  return std::nullopt;
+}
+
+Result<TextureAtlas> build_texture_atlas(const Mesh& untextured, const Rig& rig, std::span<const Frame> frames,
                                          std::span<const Silhouette> silhouettes, const AtlasOptions& options,
-                                         const Work& work) {
+                                         const Work& work, std::span<const uint8_t> exact) {
   if (options.size < 256 || options.size > 8192)
     return Error{ErrorCode::invalid_argument, "atlas size " + std::to_string(options.size) + ", expected 256 … 8192"};
   if (options.gutter_texels < 0 || options.gutter_texels > 32)
     return Error{ErrorCode::invalid_argument,
                  "atlas gutter " + std::to_string(options.gutter_texels) + ", expected 0 … 32 texels"};
-  if (const auto checked = check(mesh); !checked) return checked.error();
-  if (mesh.triangles.empty()) return Error{ErrorCode::invalid_argument, "a mesh without triangles cannot be textured"};
+  if (const auto checked = check(untextured); !checked) return checked.error();
+  if (!exact.empty() && exact.size() != untextured.positions.size())
+    return Error{ErrorCode::invalid_argument, "exact: " + std::to_string(exact.size()) + " values for " +
+                                                  std::to_string(untextured.positions.size()) + " vertices"};
+  if (untextured.triangles.empty())
+    return Error{ErrorCode::invalid_argument, "a mesh without triangles cannot be textured"};
 
   TextureAtlas result;
   const std::vector<Source> sources = usable_sources(rig, frames, silhouettes, result.warnings);
   if (sources.empty())
     return Error{ErrorCode::too_few_views, "no camera of the rig has both a frame and a silhouette to texture from"};
 
+  const Inpainting inpainting = options.method == TextureMethod::full ? Inpainting::push_pull : Inpainting::telea;
+  Mesh mesh = untextured;
   std::vector<PreparedView> views(sources.size());
   work.parallel_for(sources.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end; ++i)
-      views[i] =
-          prepare_view(mesh, *sources[i].camera, *sources[i].frame, *sources[i].silhouette, rim_m, options.inpainting);
+      views[i] = prepare_view(mesh, *sources[i].camera, *sources[i].frame, *sources[i].silhouette, rim_m, inpainting);
   });
   if (work.stopped()) return Work::cancelled();
   work.report(0.3);
 
-  const CameraRatings ratings = rate_cameras(mesh, views, work);
+  const Occluder occluder(mesh);
+  const CameraRatings ratings = rate_cameras(mesh, occluder, views, work);
   result.seen_share = seen_share(mesh, ratings);
   if (!(result.seen_share > 0)) return Error{ErrorCode::too_few_views, "no camera sees the surface to texture"};
   if (work.stopped()) return Work::cancelled();
   work.report(0.4);
+
+  if (options.method == TextureMethod::full) prepare_fully(&mesh, views, ratings, exact, options, work);
+  if (work.stopped()) return Work::cancelled();
+  work.report(0.5);
 
   const Packing packing = lay_out(mesh, ratings, options, work);
   if (!(packing.texels_per_m > 0))
@@ -142,14 +203,12 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& mesh, const Rig& rig, std::
   if (work.stopped()) return Work::cancelled();
   work.report(0.6);
 
-  const std::vector<Eigen::Array3f> gains = options.balance_colours
-                                                ? balance_colours(mesh, views, ratings)
-                                                : std::vector<Eigen::Array3f>(views.size(), Eigen::Array3f::Ones());
-  TexelColours texels = blend_texels(mesh, packing, options.size, views, ratings, gains, options.blending, work);
+  TexelColours texels = paint(mesh, packing, views, ratings, occluder, options, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.95);
 
   result.used_share = texels.used_share;
+  result.positions = std::move(mesh.positions);
   result.atlas.uv = texture_coordinates(packing, options.size);
   result.atlas.image = std::move(push_pull(std::move(texels.image), texels.painted).front());
   work.report(1);

@@ -3,40 +3,71 @@
 #include <Eigen/Core>
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
 
 #include "pipeline/atlas/input_preparation.h"
-#include "pipeline/atlas/linear_light.h"
 
 namespace booth {
 
+namespace sampling {
+
+/// A pixel's red, green, blue and padding.
+inline Eigen::Array4f pixel_at(const uint16_t* p) {
+  return {static_cast<float>(p[0]), static_cast<float>(p[1]), static_cast<float>(p[2]), static_cast<float>(p[3])};
+}
+
+}  // namespace sampling
+
 /// Linear light at a pixel of level 0, interpolated bilinearly on one level of the pyramid.
-inline Eigen::Array3f sample_level(const Pyramid& pyramid, size_t level, float x, float y) {
-  const Image& image = pyramid[level];
+inline Eigen::Array3f sample_level(const LightPyramid& pyramid, size_t level, float x, float y) {
+  const LightImage& image = pyramid[level];
   const float scale = 1 / static_cast<float>(1 << level);
   const float u = std::clamp((x + 0.5F) * scale - 0.5F, 0.0F, static_cast<float>(image.width - 1));
   const float v = std::clamp((y + 0.5F) * scale - 0.5F, 0.0F, static_cast<float>(image.height - 1));
   const int u0 = std::min(static_cast<int>(u), std::max(0, image.width - 2));
   const int v0 = std::min(static_cast<int>(v), std::max(0, image.height - 2));
   const float fu = u - static_cast<float>(u0), fv = v - static_cast<float>(v0);
-  const uint8_t* a = image.pixel(u0, v0);
-  const uint8_t* b = image.width > 1 ? a + 3 : a;
-  const uint8_t* c = image.height > 1 ? a + 3 * image.width : a;
-  const uint8_t* d = image.width > 1 ? c + 3 : c;
-  Eigen::Array3f light;
-  for (int k = 0; k < 3; ++k)
-    light[k] = (1 - fv) * ((1 - fu) * linear_from_srgb(a[k]) + fu * linear_from_srgb(b[k])) +
-               fv * ((1 - fu) * linear_from_srgb(c[k]) + fu * linear_from_srgb(d[k]));
-  return light;
+  const uint16_t* a = image.pixel(u0, v0);
+  const uint16_t* b = image.width > 1 ? a + 4 : a;
+  const ptrdiff_t down = image.height > 1 ? 4 * static_cast<ptrdiff_t>(image.width) : 0;
+  using sampling::pixel_at;
+  const Eigen::Array4f light = (1 - fv) * ((1 - fu) * pixel_at(a) + fu * pixel_at(b)) +
+                               fv * ((1 - fu) * pixel_at(a + down) + fu * pixel_at(b + down));
+  return light.head<3>() / full_light;
 }
 
-/// The same with a footprint of 2^lod pixels: between two levels, linearly.
-inline Eigen::Array3f sample_pyramid(const Pyramid& pyramid, float lod, float x, float y) {
+/// The same on level 0 by cubic convolution, which keeps the detail that bilinear interpolation blurs. Next to the
+/// image's border it is bilinear.
+/// Source: R. Keys, "Cubic convolution interpolation for digital image processing", IEEE ASSP 29(6), 1981.
+inline Eigen::Array3f sample_cubic(const LightPyramid& pyramid, float x, float y) {
+  const LightImage& image = pyramid.front();
+  const int u0 = static_cast<int>(std::floor(x)), v0 = static_cast<int>(std::floor(y));
+  if (!(u0 >= 1 && v0 >= 1 && u0 + 2 < image.width && v0 + 2 < image.height)) return sample_level(pyramid, 0, x, y);
+  const auto weights = [](float f) -> Eigen::Array4f {
+    const float f2 = f * f, f3 = f2 * f;
+    return {-0.5F * f + f2 - 0.5F * f3, 1 - 2.5F * f2 + 1.5F * f3, 0.5F * f + 2 * f2 - 1.5F * f3,
+            -0.5F * f2 + 0.5F * f3};
+  };
+  const Eigen::Array4f across = weights(x - static_cast<float>(u0)), along = weights(y - static_cast<float>(v0));
+  Eigen::Array4f light = Eigen::Array4f::Zero();
+  const uint16_t* row = image.pixel(u0 - 1, v0 - 1);
+  for (int j = 0; j < 4; ++j, row += 4 * static_cast<ptrdiff_t>(image.width))
+    light += along[j] * (across[0] * sampling::pixel_at(row) + across[1] * sampling::pixel_at(row + 4) +
+                         across[2] * sampling::pixel_at(row + 8) + across[3] * sampling::pixel_at(row + 12));
+  return light.head<3>().max(0) / full_light;
+}
+
+/// Linear light under a footprint of 2^lod pixels: between two levels, linearly, so that nothing aliases where a texel
+/// covers several pixels; by cubic convolution where it covers one or less.
+/// Source: L. Williams, "Pyramidal parametrics", SIGGRAPH 1983.
+inline Eigen::Array3f sample_pyramid(const LightPyramid& pyramid, float lod, float x, float y) {
   const float level = std::clamp(lod, 0.0F, static_cast<float>(pyramid.size() - 1));
   const auto fine = static_cast<size_t>(level);
   const float rest = level - static_cast<float>(fine);
   constexpr float negligible = 0.05F;
-  if (rest < negligible) return sample_level(pyramid, fine, x, y);
-  return (1 - rest) * sample_level(pyramid, fine, x, y) + rest * sample_level(pyramid, fine + 1, x, y);
+  const Eigen::Array3f light = fine == 0 ? sample_cubic(pyramid, x, y) : sample_level(pyramid, fine, x, y);
+  if (rest < negligible) return light;
+  return (1 - rest) * light + rest * sample_level(pyramid, fine + 1, x, y);
 }
 
 /// What is known about a surface point in a camera; both 0 … 1.

@@ -85,6 +85,7 @@ std::string write_metadata(const AvatarMetadata& metadata) {
                        {"recording", metadata.recording},
                        {"software_version", metadata.software_version},
                        {"face", metadata.face},
+                       {"texture_method", metadata.texture_method},
                        {"cameras", metadata.cameras},
                        {"triangles", metadata.triangles},
                        {"joints", metadata.joints},
@@ -107,6 +108,7 @@ Result<AvatarMetadata> read_metadata(std::string_view json) {
   reader.read("recording", metadata.recording);
   reader.read("software_version", metadata.software_version);
   reader.read_optional("face", metadata.face);
+  reader.read_optional("texture_method", metadata.texture_method);
   reader.read_optional("cameras", metadata.cameras);
   reader.read("triangles", metadata.triangles);
   reader.read("joints", metadata.joints);

@@ -26,6 +26,7 @@ struct AvatarMetadata {
   std::string software_version = BOOTH_VERSION;
   std::vector<std::string> cameras;  ///< ids of those that shaped it
   std::string face = "none";         ///< how it was made: "active", "passive", or "none": the hull's own
+  std::string texture_method = {};   ///< "full", "blend" or "best_view"; empty where there is none
   uint64_t triangles = 0;
   uint64_t joints = 0;
   std::vector<std::pair<std::string, double>> stage_seconds;  ///< in the order the stages ran
@@ -35,7 +36,8 @@ struct AvatarMetadata {
 
 /// The metadata as JSON text, an object with these keys, in this order:
 ///
-///     id, created, label, recording, software_version, face   strings
+///     id, created, label, recording, software_version, face,
+///     texture_method                                          strings
 ///     cameras, warnings                                       arrays of strings
 ///     triangles, joints                                       whole numbers
 ///     stage_seconds                                           {"hull": 0.21, …}
@@ -44,8 +46,8 @@ struct AvatarMetadata {
 /// Bytes that are not UTF-8 are replaced by U+FFFD.
 std::string write_metadata(const AvatarMetadata& metadata);
 
-/// Reads it back. Keys that this version does not know are ignored; `label`, `face`, `cameras`, `warnings`,
-/// `stage_seconds` and `files` may be missing.
+/// Reads it back. Keys that this version does not know are ignored; `label`, `face`, `texture_method`, `cameras`,
+/// `warnings`, `stage_seconds` and `files` may be missing.
 /// @error invalid_file  not JSON, a key of the others is missing, or a value is of another kind; names the key
 Result<AvatarMetadata> read_metadata(std::string_view json);
 

@@ -21,6 +21,7 @@ AvatarMetadata example() {
           .recording = "2026-11-22T10-14-00Z-11aa",
           .software_version = "1.2.3",
           .cameras = {"body-00", "body-01"},
+          .texture_method = "full",
           .triangles = 19998,
           .joints = 23,
           .stage_seconds = {{"segmentation", 0.25}, {"hull", 0.125}},
@@ -41,6 +42,7 @@ TEST(Metadata, ComesBack) {
   EXPECT_EQ(read->label, written.label);
   EXPECT_EQ(read->recording, written.recording);
   EXPECT_EQ(read->software_version, written.software_version);
+  EXPECT_EQ(read->texture_method, written.texture_method);
   EXPECT_EQ(read->cameras, written.cameras);
   EXPECT_EQ(read->triangles, written.triangles);
   EXPECT_EQ(read->joints, written.joints);

@@ -10,6 +10,7 @@
 #include <functional>
 #include <map>
 #include <memory>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -183,13 +184,12 @@ TEST_F(TextureAtlasOfAPerson, HasTheirColoursWithoutSeams) {
   }
 }
 
-TEST_F(TextureAtlasOfAPerson, HasTheirColoursByThePapersMethodToo) {
-  const TextureAtlas result = textured(*scene_, {.size = 512,
-                                                 .charting = Charting::unfolding,
-                                                 .inpainting = Inpainting::telea,
-                                                 .blending = Blending::rating_mean,
-                                                 .balance_colours = false});
-  EXPECT_LT(mean_error(scene_->mesh, result.atlas, synthetic::colour_at), 5.0);
+TEST_F(TextureAtlasOfAPerson, HasTheirColoursByTheMethodsOfReferenceToo) {
+  for (const TextureMethod method : {TextureMethod::best_view, TextureMethod::blend}) {
+    const TextureAtlas result = textured(*scene_, {.size = 512, .charting = Charting::unfolding, .method = method});
+    EXPECT_LT(mean_error(scene_->mesh, result.atlas, synthetic::colour_at), 5.0) << to_string(method);
+    EXPECT_EQ(result.positions, scene_->mesh.positions) << to_string(method);
+  }
 }
 
 TEST_F(TextureAtlasOfAPerson, IsTheSameOnAnyNumberOfThreads) {
@@ -197,6 +197,36 @@ TEST_F(TextureAtlasOfAPerson, IsTheSameOnAnyNumberOfThreads) {
   const TextureAtlas serial = textured(*scene_), parallel = textured(*scene_, small, pool.work());
   EXPECT_EQ(serial.atlas.image.samples, parallel.atlas.image.samples);
   EXPECT_EQ(serial.atlas.uv, parallel.atlas.uv);
+}
+
+TEST_F(TextureAtlasOfAPerson, IsTheSameWhateverTheOrderOfTheCameras) {
+  Scene shuffled = *scene_;
+  std::rotate(shuffled.rig.cameras.begin(), shuffled.rig.cameras.begin() + 2, shuffled.rig.cameras.end());
+  std::reverse(shuffled.frames.begin(), shuffled.frames.end());
+  std::swap(shuffled.silhouettes[0], shuffled.silhouettes[3]);
+  for (const TextureMethod method : {TextureMethod::blend, TextureMethod::full}) {
+    const AtlasOptions options{.size = 512, .method = method};
+    const TextureAtlas one = textured(*scene_, options), other = textured(shuffled, options);
+    EXPECT_EQ(one.atlas.image.samples, other.atlas.image.samples) << to_string(method);
+    EXPECT_EQ(one.positions, other.positions) << to_string(method);
+  }
+}
+
+// Its charts' borders show no other chart in smaller versions of the atlas either.
+TEST_F(TextureAtlasOfAPerson, HasNoSeamsInItsMipMaps) {
+  TextureAtlas result = textured(*scene_, {.size = 1024});
+  for (int level = 1; level <= 2; ++level) {
+    const Image& fine = result.atlas.image;
+    Image coarse(fine.width / 2, fine.height / 2, 3);
+    for (int y = 0; y < coarse.height; ++y)
+      for (int x = 0; x < coarse.width; ++x)
+        for (int c = 0; c < 3; ++c)
+          coarse.at(x, y, c) = static_cast<uint8_t>((fine.at(2 * x, 2 * y, c) + fine.at(2 * x + 1, 2 * y, c) +
+                                                     fine.at(2 * x, 2 * y + 1, c) + fine.at(2 * x + 1, 2 * y + 1, c)) /
+                                                    4);
+    result.atlas.image = std::move(coarse);
+    EXPECT_LT(seam_difference(scene_->mesh, result.atlas), 3.0) << "level " << level;
+  }
 }
 
 TEST_F(TextureAtlasOfAPerson, DoesNotShowCamerasOfDifferentGain) {
@@ -307,6 +337,42 @@ TEST(TextureAtlas, WhatStandsInFrontDoesNotPrintOnWhatIsBehind) {
     if ((s.colour.x() > s.colour.z()) != is_bar(s.position)) ++wrong;
   }
   EXPECT_LT(static_cast<double>(wrong), 0.005 * static_cast<double>(all));
+}
+
+// Stripes of many widths on a ball that is 6 mm smaller than its mesh: the cameras tell where the surface is.
+TEST(TextureAtlas, LaysTheSurfaceWhereTheCamerasAgreeButNotWhereItIsKnown) {
+  constexpr double radius_m = 0.4, too_large_m = 0.006;
+  const Paint paint = [](const Eigen::Vector3d& p) {
+    const double wave = std::sin(70 * p.y() + 9 * std::sin(21 * p.x())) + std::sin(60 * p.x() + 50 * p.z());
+    return Eigen::Vector3d::Constant(0.5 + 0.2 * wave);
+  };
+  Scene scene = photographed(synthetic::sphere(radius_m), paint, 0.03, {.cameras = 10, .width = 240, .height = 320});
+  const Eigen::Vector3d middle = [&] {
+    Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+    for (const Eigen::Vector3f& p : scene.mesh.positions) sum += p.cast<double>();
+    return Eigen::Vector3d(sum / static_cast<double>(scene.mesh.positions.size()));
+  }();
+  for (Eigen::Vector3f& p : scene.mesh.positions)
+    p = (middle + (radius_m + too_large_m) * (p.cast<double>() - middle).normalized()).cast<float>();
+  const auto mean_distance = [&](const std::vector<Eigen::Vector3f>& positions) {
+    double sum = 0, count = 0;
+    for (const Eigen::Vector3f& p : positions) {
+      if (std::abs(static_cast<double>(p.y()) - middle.y()) > 0.6 * radius_m) continue;  // seen from all around
+      sum += std::abs((p.cast<double>() - middle).norm() - radius_m);
+      ++count;
+    }
+    return sum / count;
+  };
+  EXPECT_LT(mean_distance(textured(scene).positions), 0.5 * too_large_m);
+
+  const std::vector<uint8_t> exact(scene.mesh.positions.size(), 1);
+  const auto kept = build_texture_atlas(scene.mesh, scene.rig, scene.frames, scene.silhouettes, small, {}, exact);
+  ASSERT_TRUE(kept.ok());
+  EXPECT_EQ(kept.value().positions, scene.mesh.positions);
+  const auto refused =
+      build_texture_atlas(scene.mesh, scene.rig, scene.frames, scene.silhouettes, small, {}, std::span(exact).first(3));
+  ASSERT_FALSE(refused.ok());
+  EXPECT_EQ(refused.error().code, ErrorCode::invalid_argument);
 }
 
 // Seen from one side only: the other side continues the colours around it.

@@ -136,20 +136,23 @@ double RayCaster::distance_m(const Eigen::Vector3d& p) const {
 Mesh read_ply(const std::filesystem::path& file) {
   std::ifstream stream(file, std::ios::binary);
   stream.exceptions(std::ios::failbit | std::ios::badbit);
-  size_t vertices = 0, faces = 0, colour_bytes = 0;
+  size_t vertices = 0, faces = 0, floats = 0, colour_bytes = 0;
   for (std::string line; line != "end_header";) {
     std::getline(stream, line);
     if (line.rfind("element vertex ", 0) == 0) vertices = std::stoul(line.substr(15));
     if (line.rfind("element face ", 0) == 0) faces = std::stoul(line.substr(13));
+    if (line.rfind("property float ", 0) == 0) ++floats;
     if (line.rfind("property uchar ", 0) == 0) ++colour_bytes;
   }
   Mesh mesh;
   mesh.positions.resize(vertices);
-  std::array<char, 16> skipped{};
-  if (colour_bytes > skipped.size()) throw std::runtime_error(file.string() + ": too many properties");
+  std::array<char, 32> skipped{};
+  if (floats < 3) throw std::runtime_error(file.string() + ": a vertex has no position");
+  const size_t others = (floats - 3) * sizeof(float) + colour_bytes;
+  if (others > skipped.size()) throw std::runtime_error(file.string() + ": too many properties");
   for (Eigen::Vector3f& p : mesh.positions) {
     stream.read(reinterpret_cast<char*>(p.data()), 3 * sizeof(float));
-    stream.read(skipped.data(), static_cast<std::streamsize>(colour_bytes));
+    stream.read(skipped.data(), static_cast<std::streamsize>(others));
   }
   mesh.triangles.resize(faces);
   for (auto& triangle : mesh.triangles) {

@@ -38,7 +38,7 @@ class RayCaster {
   std::unique_ptr<Scene> scene_;
 };
 
-/// A binary little-endian PLY file's vertices and triangles. Throws what the standard library throws at files that are
+/// A binary little-endian PLY file's vertices, whose position comes first, and triangles. Throws what the standard library throws at files that are
 /// none: truth files are part of a test.
 Mesh read_ply(const std::filesystem::path& file);
 
