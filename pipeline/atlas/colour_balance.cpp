@@ -34,13 +34,13 @@ std::vector<float> relative_areas(const Mesh& mesh) {
 }
 
 std::vector<Pair> overlaps(const Mesh& mesh, std::span<const PreparedView> views, const CameraRatings& ratings) {
-  constexpr float good_share = 0.35F;                   // of the best camera's rating
-  constexpr float least_trust = 0.9F;                   // clear of outlines and depth steps
+  constexpr float good_share = 0.1F;                    // of the best camera's rating
+  constexpr float least_trust = 0.5F;                   // clear of outlines and depth steps
   constexpr size_t level = 2;                           // blurred by four pixels: the surface is not exact
   constexpr float darkest = 0.003F, brightest = 0.85F;  // noise below, clipping above
   struct Sample {
     int camera;
-    float rating;
+    float weight;  ///< of a slanted or doubtful look little, but where two cameras share no better one, enough
     Eigen::Array3f light;
   };
   std::vector<Pair> pairs;
@@ -60,12 +60,11 @@ std::vector<Pair> overlaps(const Mesh& mesh, std::span<const PreparedView> views
       const Eigen::Array3f light =
           sample_level(views[c].colours, std::min(level, views[c].colours.size() - 1), p.x(), p.y());
       if (light.minCoeff() < darkest || light.maxCoeff() > brightest) continue;
-      samples.push_back({static_cast<int>(c), rating[c] / best, light.log()});
+      samples.push_back({static_cast<int>(c), rating[c] / best * trust.visible * trust.confidence, light.log()});
     }
     for (size_t i = 0; i < samples.size(); ++i)
       for (size_t j = i + 1; j < samples.size(); ++j)
-        pairs.push_back({samples[i].camera, samples[j].camera,
-                         areas[v] * std::sqrt(samples[i].rating * samples[j].rating),
+        pairs.push_back({samples[i].camera, samples[j].camera, areas[v] * samples[i].weight * samples[j].weight,
                          samples[i].light - samples[j].light});
   }
   return pairs;
@@ -78,9 +77,10 @@ std::vector<Eigen::Array3f> balance_colours(const Mesh& mesh, std::span<const Pr
   const auto cameras = static_cast<Eigen::Index>(views.size());
   const std::vector<Pair> pairs = overlaps(mesh, views, ratings);
   std::vector<Eigen::Array3f> gains(views.size(), Eigen::Array3f::Ones());
-  constexpr int rounds = 8;
+  constexpr int rounds = 8;       // the last two at the scale
   constexpr double scale = 0.08;  // log units: what disagrees by more is another surface or a highlight
-  constexpr double prior = 1.0;   // in observations: keeps cameras without overlap at 1
+  // In observations: keeps cameras without overlap at 1, and is nothing against the few that a narrow overlap has.
+  constexpr double prior = 1e-3;
   for (int channel = 0; channel < 3; ++channel) {
     Eigen::VectorXd correction = Eigen::VectorXd::Zero(cameras);
     for (int round = 0; round < rounds; ++round) {
@@ -89,8 +89,9 @@ std::vector<Eigen::Array3f> balance_colours(const Mesh& mesh, std::span<const Pr
       for (const Pair& pair : pairs) {
         const auto difference = static_cast<double>(pair.difference[channel]);
         const double residual = difference + correction[pair.one] - correction[pair.other];
-        // The first round is plain: only then is it known what an outlier is.
-        const double robust = round == 0 ? 1 : 1 / (1 + residual * residual / (scale * scale));
+        // From plain least squares to the scale step by step: what an outlier is shows only beside good gains.
+        const double tolerated = scale * std::exp2(std::max(0, rounds - 2 - round));
+        const double robust = round == 0 ? 1 : 1 / (1 + residual * residual / (tolerated * tolerated));
         const double weight = static_cast<double>(pair.weight) * robust;
         normal(pair.one, pair.one) += weight;
         normal(pair.other, pair.other) += weight;

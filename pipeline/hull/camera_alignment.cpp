@@ -4,7 +4,10 @@
 #include <algorithm>
 #include <cmath>
 #include <memory>
+#include <numeric>
+#include <optional>
 #include <span>
+#include <utility>
 
 #include "pipeline/hull/pose_estimation.h"
 
@@ -26,6 +29,9 @@ constexpr double surely_moved_px = 10;
 constexpr double suspicious = 5;
 /// A second one by so many times more: where the first was put leaves some doubt.
 constexpr double next_suspicious = 1.5;
+/// As suspicious as the first is who deviates by that much of its deviation; so many are looked at.
+constexpr double alike = 0.7;
+constexpr size_t most_suspects = 3;
 /// Half of the cameras of a well calibrated rig deviate by less.
 constexpr double usual = 2.4;
 /// A camera that is put back where it belongs takes most of the misses with it that it is part of. Counted are those
@@ -157,12 +163,20 @@ struct Look {
   std::vector<PoseChange> left;  ///< by view: what those still ask for that were put back
   std::vector<double> misses;    ///< by view: of the samples that it is part of, how far they miss
 
+  double all_misses() const { return std::accumulate(misses.begin(), misses.end(), 0.0); }
+
   /// How far all of them deviate, compared to those of a well calibrated rig; at least 1.
   double unrest() const {
     std::vector<double> deviations;
     for (const Camera& camera : cameras) deviations.push_back(camera.deviation);
     return std::max(1.0, median(std::move(deviations)) / usual);
   }
+};
+
+/// One camera put where it asks to be, and what all look like then.
+struct Trial {
+  Look::Camera suspect;
+  Look look;
 };
 
 /// @param free  cameras that were found to have moved
@@ -218,22 +232,35 @@ std::vector<CameraDeviation> realign_cameras(Rig& rig, SilhouetteViews& views, c
   double least = suspicious;
   for (size_t moved = 0; moved < views.size() / 3; ++moved) {
     if (look.cameras.empty() || look.cameras.front().deviation <= least) break;
-    const Look::Camera suspect = look.cameras.front();
-    const double missed = look.misses[suspect.view];
-    const Eigen::Isometry3d as_calibrated = views[suspect.view]->camera().camera_from_world;
-    // From where it belongs, all others are measured anew: what it stirred up in them is not theirs.
-    put(suspect.view, changed_pose(as_calibrated, suspect.change));
-    free[suspect.view] = true;
-    look = look_at(views, hull, free, work);
-    if (look.cameras.empty()) return found;
-    if (suspect.deviation <= least * look.unrest() || look.misses[suspect.view] > settled_share * missed) {
+    // Cameras that face each other see the same outline, so that either may seem to have moved: each of those that are
+    // about as suspicious is put back where it would belong, and the one without which the others agree best it was.
+    std::vector<Look::Camera> suspects = look.cameras;
+    const double enough = std::max(least, alike * suspects.front().deviation);
+    std::erase_if(suspects, [&](const Look::Camera& camera) { return camera.deviation < enough; });
+    if (suspects.size() > most_suspects) suspects.resize(most_suspects);
+    std::optional<Trial> best;
+    for (const Look::Camera& suspect : suspects) {
+      const Eigen::Isometry3d as_calibrated = views[suspect.view]->camera().camera_from_world;
+      // From where it belongs, all others are measured anew: what it stirred up in them is not theirs.
+      put(suspect.view, changed_pose(as_calibrated, suspect.change));
+      free[suspect.view] = true;
+      Trial trial{suspect, look_at(views, hull, free, work)};
       put(suspect.view, as_calibrated);
-      break;
+      free[suspect.view] = false;
+      if (trial.look.cameras.empty()) return found;
+      if (!best || trial.look.all_misses() < best->look.all_misses()) best = std::move(trial);
     }
+    const Look::Camera& suspect = best->suspect;
+    if (suspect.deviation <= least * best->look.unrest() ||
+        best->look.misses[suspect.view] > settled_share * look.misses[suspect.view])
+      break;
+    put(suspect.view, changed_pose(views[suspect.view]->camera().camera_from_world, suspect.change));
+    free[suspect.view] = true;
+    found[suspect.view] = {.offset_px = suspect.offset_px, .deviation = suspect.deviation, .moved = true};
+    look = std::move(best->look);
     for (size_t v = 0; v < views.size(); ++v)
       if (free[v]) put(v, changed_pose(views[v]->camera().camera_from_world, look.left[v]));
     note(look);
-    found[suspect.view] = {.offset_px = suspect.offset_px, .deviation = suspect.deviation, .moved = true};
     least = suspicious * next_suspicious;
   }
   return found;

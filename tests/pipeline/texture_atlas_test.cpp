@@ -245,6 +245,30 @@ TEST_F(TextureAtlasOfAPerson, DoesNotShowCamerasOfDifferentGain) {
   EXPECT_LT(with, 0.6 * without);
 }
 
+TEST_F(TextureAtlasOfAPerson, IsUniformWhereTheyAreWhateverTheGains) {
+  const std::array<double, 6> gains{1, 0.7, 1.25, 0.85, 1.1, 0.6};
+  const Eigen::Array3d colour(0.35, 0.22, 0.16);  // linear light
+  Scene uniform = *scene_;
+  for (size_t i = 0; i < uniform.frames.size(); ++i) {
+    auto image = std::make_shared<Image>(*uniform.frames[i].pixels);
+    const Image& coverage = uniform.silhouettes[i].coverage;
+    for (size_t pixel = 0; pixel < coverage.samples.size(); ++pixel)
+      for (size_t c = 0; c < 3; ++c) {
+        const double light = gains[i] * (coverage.samples[pixel] != 0 ? colour[static_cast<Eigen::Index>(c)] : 0.5);
+        image->samples[3 * pixel + c] =
+            static_cast<uint8_t>(std::lround(255 * (1.055 * std::pow(light, 1 / 2.4) - 0.055)));
+      }
+    uniform.frames[i].pixels = std::move(image);
+  }
+  const TextureAtlas result = textured(uniform);
+  Eigen::Array3d least = Eigen::Array3d::Constant(255), most = Eigen::Array3d::Zero();
+  for (const Sample& s : middles(uniform.mesh, result.atlas)) {
+    least = least.min(s.colour.array());
+    most = most.max(s.colour.array());
+  }
+  EXPECT_LE((most - least).maxCoeff(), 1.0) << least.transpose() << " … " << most.transpose();
+}
+
 TEST_F(TextureAtlasOfAPerson, DoesNotLetAFinelyMeshedGlossyHeadDecideTheBodysColours) {
   constexpr float neck = 1.45F;  // of the synthetic person, metres
   Scene glossy = *scene_;
