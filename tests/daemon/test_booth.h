@@ -32,7 +32,7 @@ using Json = nlohmann::json;
 namespace fs = std::filesystem;
 
 /// Long enough for a machine that is busy and a sanitizer that is slow; nothing passes by waiting for it.
-constexpr std::chrono::seconds long_enough{60};
+constexpr std::chrono::seconds long_enough{240};
 
 inline bool wait_until(const std::function<bool()>& holds, std::chrono::milliseconds patience = long_enough) {
   const auto deadline = std::chrono::steady_clock::now() + patience;
