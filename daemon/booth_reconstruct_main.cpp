@@ -113,6 +113,7 @@ void tell_health(const ProgressPipe& pipe, const std::vector<CameraHealth>& came
                  {"offset_px", camera.offset_px},
                  {"deviation", camera.deviation},
                  {"light_factor", camera.light_factor},
+                 {"shifted", camera.shifted},
                  {"background_px", camera.background_px},
                  {"background_share", camera.background_share}}}});
   pipe.tell({{"health", nullptr}});

@@ -12,8 +12,14 @@ constexpr double telling_share = 0.5;
 std::string drift_message(const CameraHealth& camera) {
   std::ostringstream text;
   text.precision(2);
-  text << "camera " << camera.camera << " no longer stands where it was calibrated: its picture is off by "
-       << camera.offset_px << " pixels from where the other cameras expect it. Fasten it and calibrate the booth anew";
+  text << "camera " << camera.camera;
+  if (camera.moved)
+    text << " no longer stands where it was calibrated: its picture is off by " << camera.offset_px
+         << " pixels from where the other cameras expect it";
+  else
+    text << " no longer stands where it stood when the background was learned: its picture of the booth is off by "
+         << camera.background_px << " pixels";
+  text << ". Fasten it and calibrate the booth anew, or let \"boothctl calibrate --correct\" propose a correction";
   return text.str();
 }
 
@@ -25,7 +31,7 @@ void HealthMonitor::report(const std::string& capture, const std::vector<CameraH
     const std::lock_guard lock(mutex_);
     cameras_ = cameras;
     for (const CameraHealth& camera : cameras)
-      if (camera.moved)
+      if (camera.moved || camera.shifted)
         alerts.push_back(
             {Severity::warning, "calibration_drift", drift_message(camera) + " (capture " + capture + ")"});
     std::vector<double> factors;
@@ -57,14 +63,15 @@ std::vector<std::string> HealthMonitor::moved() const {
   const std::lock_guard lock(mutex_);
   std::vector<std::string> ids;
   for (const CameraHealth& camera : cameras_)
-    if (camera.moved) ids.push_back(camera.camera);
+    if (camera.moved || camera.shifted || displaced_.contains(camera.camera)) ids.push_back(camera.camera);
   return ids;
 }
 
 void HealthMonitor::calibrated() {
   const std::lock_guard lock(mutex_);
+  displaced_.clear();
   for (CameraHealth& camera : cameras_) {
-    camera.moved = false;
+    camera.moved = camera.shifted = false;
     camera.offset_px = camera.deviation = 0;
   }
 }
@@ -74,6 +81,8 @@ void HealthMonitor::background_learned() {
   light_.reset();
   asked_ = false;
   for (CameraHealth& camera : cameras_) {
+    if (camera.shifted) displaced_.insert(camera.camera);
+    camera.shifted = false;
     camera.light_factor = camera.background_share = 1;
     camera.background_px = 0;
   }

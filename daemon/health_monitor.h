@@ -3,6 +3,7 @@
 #include <chrono>
 #include <mutex>
 #include <optional>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -17,13 +18,15 @@ class HealthMonitor {
  public:
   HealthMonitor(BackgroundConfig config, EventBus& events) : config_(config), events_(events) {}
 
-  /// What the latest capture says: an alert of the kind calibration_drift for each camera that was moved, one of the
-  /// kind background_stale where the light is no longer that of the background.
+  /// What the latest capture says: an alert of the kind calibration_drift for each camera that was moved, which its
+  /// silhouette or its background tells, one of the kind background_stale where the light is no longer that of the
+  /// background.
   void report(const std::string& capture, const std::vector<CameraHealth>& cameras);
 
   /// By camera, of the latest capture.
   std::vector<CameraHealth> cameras() const;
-  /// Ids of those that no longer stand where they were calibrated.
+  /// Ids of those that no longer stand where they were calibrated; those whose background showed it stay among them
+  /// when the background is learned anew, until the booth is calibrated.
   std::vector<std::string> moved() const;
 
   /// The calibration is another one now: nothing is known against it.
@@ -43,6 +46,7 @@ class HealthMonitor {
   EventBus& events_;
   mutable std::mutex mutex_;
   std::vector<CameraHealth> cameras_;  ///< guarded by mutex_
+  std::set<std::string> displaced_;    ///< guarded by mutex_; shifted against a background before the present one
   std::optional<std::string> light_;   ///< guarded by mutex_; a sentence: how the light has changed
   bool asked_ = false;                 ///< guarded by mutex_
 };

@@ -95,13 +95,18 @@ double number_of(const Json& object, const char* key, double otherwise) {
   return found != object.end() && found->is_number() ? found->get<double>() : otherwise;
 }
 
+bool flag_of(const Json& object, const char* key) {
+  const auto found = object.find(key);
+  return found != object.end() && found->is_boolean() && found->get<bool>();
+}
+
 CameraHealth health_of(const Json& object) {
-  const auto moved = object.find("moved");
   return {.camera = text_of(object, "camera", ""),
-          .moved = moved != object.end() && moved->is_boolean() && moved->get<bool>(),
+          .moved = flag_of(object, "moved"),
           .offset_px = number_of(object, "offset_px", 0),
           .deviation = number_of(object, "deviation", 0),
           .light_factor = number_of(object, "light_factor", 1),
+          .shifted = flag_of(object, "shifted"),
           .background_px = number_of(object, "background_px", 0),
           .background_share = number_of(object, "background_share", 1)};
 }

@@ -14,6 +14,7 @@
 #include "pipeline/face/face_sewing.h"
 #include "pipeline/face/field_fusion.h"
 #include "pipeline/geometry/solid_parts.h"
+#include "pipeline/health/background_registration.h"
 #include "pipeline/image/develop.h"
 #include "pipeline/surface/marching_cubes.h"
 #include "pipeline/surface/self_intersection.h"
@@ -94,16 +95,35 @@ Result<CaptureFrames> develop_all(const CaptureFrames& capture, const Work& work
   return developed;
 }
 
+/// What one frame shows.
+struct SegmentedView {
+  Segmentation segmentation;
+  BackgroundMotion motion;
+};
+Result<SegmentedView> look_at(const CaptureFrames& capture, const Frame& frame, const SegmentationOptions& options,
+                              const Work& work) {
+  const std::vector<Frame> background = background_of(frame.camera, capture.background);
+  auto segmentation = segment(background, frame, options, work);
+  if (!segmentation) return segmentation.error();
+  BackgroundMotion motion;
+  if (const RigCamera* camera = capture.rig.find(frame.camera)) {
+    const auto registered =
+        register_background(background, frame, segmentation->silhouette.coverage, camera->intrinsics);
+    if (!registered) return registered.error();
+    motion = *registered;
+  }
+  return SegmentedView{std::move(*segmentation), motion};
+}
+
 /// Segments every camera that can be; a camera that cannot is left out and said in the warnings. When nothing is
 /// left, the first camera's reason is the error.
 Result<SegmentedViews> segment_all(const CaptureFrames& capture, std::span<const Frame> frames,
                                    const SegmentationOptions& options, const Work& work) {
-  std::vector<std::optional<Result<Segmentation>>> results(frames.size());
+  std::vector<std::optional<Result<SegmentedView>>> results(frames.size());
   const Work inside{.stop = work.stop, .progress = {}, .parallel = work.parallel};
   work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end; ++i)
-      if (!inside.stopped())
-        results[i] = segment(background_of(frames[i].camera, capture.background), frames[i], options, inside);
+      if (!inside.stopped()) results[i] = look_at(capture, frames[i], options, inside);
   });
   if (work.stopped()) return Work::cancelled();
 
@@ -116,18 +136,20 @@ Result<SegmentedViews> segment_all(const CaptureFrames& capture, std::span<const
   }
   std::optional<Error> first_error;
   for (size_t i = 0; i < frames.size(); ++i) {
-    Result<Segmentation>& result = *results[i];
+    Result<SegmentedView>& result = *results[i];
     if (!result) {
       views.warnings.push_back("camera " + frames[i].camera + " was left out: " + result.error().message);
       if (!first_error) first_error = result.error();
       continue;
     }
-    views.silhouettes.push_back(std::move(result->silhouette));
+    Segmentation& segmentation = result->segmentation;
+    views.silhouettes.push_back(std::move(segmentation.silhouette));
     views.health.push_back({.camera = frames[i].camera,
-                            .light_factor = result->light_factor,
-                            .background_px = result->movement_px,
-                            .background_share = result->background_share});
-    views.warnings.insert(views.warnings.end(), result->warnings.begin(), result->warnings.end());
+                            .light_factor = segmentation.light_factor,
+                            .shifted = result->motion.moved,
+                            .background_px = result->motion.shift_px,
+                            .background_share = segmentation.background_share});
+    views.warnings.insert(views.warnings.end(), segmentation.warnings.begin(), segmentation.warnings.end());
   }
   if (views.silhouettes.empty())
     return first_error.value_or(Error{ErrorCode::too_few_views, "the capture holds no usable body image"});

@@ -12,7 +12,8 @@ struct CameraHealth {
   double offset_px = 0;         ///< by how much its picture of the subject is off
   double deviation = 0;         ///< the same in standard deviations; 0 where nobody can tell
   double light_factor = 1;      ///< how many times brighter or darker than when the background was learned, at least 1
-  double background_px = 0;     ///< by how much its picture has moved since then
+  bool shifted = false;         ///< it no longer stands where it stood then: its background is elsewhere in its picture
+  double background_px = 0;     ///< by how much it is
   double background_share = 1;  ///< of its picture, that still looks like the background but for that light, 0 … 1
 };
 

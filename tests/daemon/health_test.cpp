@@ -153,6 +153,18 @@ TEST(HealthMonitor, OneDazzledCameraIsNoChangeOfLight) {
   EXPECT_EQ(monitor.staleness(std::nullopt), std::nullopt);
 }
 
+TEST(HealthMonitor, AShiftedCameraStaysBlamedWhenTheBackgroundIsLearnedAnew) {
+  EventBus events;
+  HealthMonitor monitor({}, events);
+  monitor.report("c", {{.camera = "a"}, {.camera = "b", .shifted = true, .background_px = 0.8}});
+  EXPECT_EQ(monitor.moved(), std::vector<std::string>{"b"});
+  monitor.background_learned();
+  monitor.report("d", {{.camera = "a"}, {.camera = "b"}});
+  EXPECT_EQ(monitor.moved(), std::vector<std::string>{"b"});
+  monitor.calibrated();
+  EXPECT_THAT(monitor.moved(), IsEmpty());
+}
+
 TEST(HealthMonitor, ANewCalibrationStartsWithoutBlame) {
   EventBus events;
   HealthMonitor monitor({}, events);

@@ -15,11 +15,10 @@
 
 #include "pipeline/geometry/camera_model.h"
 #include "pipeline/hull/visual_hull.h"
-#include "pipeline/segmentation/segmentation.h"
 #include "pipeline/surface/marching_cubes.h"
 #include "pipeline/thread_pool.h"
-#include "replay/recording.h"
 #include "tests/quality/measures.h"
+#include "tests/quality/recorded_capture.h"
 #include "tests/quality/truth.h"
 
 namespace booth::quality {
@@ -42,20 +41,9 @@ class CameraConsistency : public testing::TestWithParam<const char*> {
   void SetUp() override {
     const auto folder = find_recording(GetParam());
     if (!folder) GTEST_SKIP() << "set BOOTH_RECORDINGS to the larger recordings";
-    const Recording recording = read_recording(*folder).value();
-    rig_ = recording.rig;
-    const auto background = load_shot(recording, *recording.find(ShotRole::background), work_).sets;
-    const FrameSet body = load_shot(recording, *recording.find(ShotRole::body), work_).sets.at(0);
-    silhouettes_.resize(body.frames.size());
-    work_.parallel_for(body.frames.size(), 1, [&](size_t begin, size_t end) {
-      for (size_t i = begin; i < end; ++i) {
-        std::vector<Frame> empty;
-        for (const FrameSet& set : background)
-          for (const Frame& frame : set.frames)
-            if (frame.camera == body.frames[i].camera) empty.push_back(frame);
-        silhouettes_[i] = segment(empty, body.frames[i], {}).value().silhouette;
-      }
-    });
+    RecordedCapture capture = load_capture(*folder, work_);
+    rig_ = std::move(capture.rig);
+    silhouettes_ = std::move(capture.silhouettes);
     joints_ = read_joints(*folder / "truth/joints.json");
     const Mesh truth = read_ply(*folder / "truth/mesh.ply");
     truth_ = std::make_unique<RayCaster>(truth);
