@@ -7,6 +7,7 @@
 #include <cmath>
 #include <iomanip>
 #include <limits>
+#include <regex>
 #include <set>
 #include <sstream>
 #include <system_error>
@@ -40,6 +41,10 @@ template <class Visitor>
 void visit_api(Visitor& visitor, ApiConfig& api) {
   visitor.endpoint("control", api.control);
   visitor.endpoint("events", api.events);
+  visitor.remote_endpoint("remote_control", api.remote_control);
+  visitor.remote_endpoint("remote_events", api.remote_events);
+  visitor.path("server_key", api.server_key);
+  visitor.path("client_keys", api.client_keys);
 }
 
 template <class Visitor>
@@ -393,6 +398,16 @@ std::string one_line(std::string text) {
   return text;
 }
 
+/// "tcp://ADDRESS:PORT": a name, an IPv4 address, an IPv6 address in brackets, or "*" for every address of the machine.
+bool is_tcp_endpoint(const std::string& text) {
+  static const std::regex form(R"(tcp://(\*|[A-Za-z0-9._-]{1,253}|\[[0-9A-Fa-f:.%a-z]{2,64}\]):([0-9]{1,5}))");
+  std::smatch match;
+  constexpr int highest_port = 65535;
+  if (!std::regex_match(text, match, form)) return false;
+  const int port = std::stoi(match[2]);
+  return port >= 1 && port <= highest_port;
+}
+
 std::string quoted(const toml::node& node) {
   if (node.is_table()) return "a table";
   if (node.is_array()) return "an array";
@@ -542,10 +557,20 @@ class Reader {
     const auto text = node->value_exact<std::string>();
     const std::string local = "ipc://";
     constexpr size_t longest = 107;  // of a Unix socket's path
-    if (text && text->starts_with("tcp://"))
-      return refuse(key, *node, "ipc:///PATH: this version offers no encryption, and without it tcp:// is refused");
-    if (!text || !text->starts_with(local + "/") || text->size() > local.size() + longest || has_control(*text))
-      return refuse(key, *node, "ipc:///PATH with a path of at most " + std::to_string(longest) + " bytes");
+    const bool is_local =
+        text && text->starts_with(local + "/") && text->size() <= local.size() + longest && !has_control(*text);
+    if (!text || (!is_local && !is_tcp_endpoint(*text)))
+      return refuse(key, *node,
+                    "ipc:///PATH with a path of at most " + std::to_string(longest) + " bytes, or tcp://ADDRESS:PORT");
+    value = *text;
+  }
+
+  void remote_endpoint(const char* key, std::string& value) {
+    const toml::node* node = take(key);
+    if (node == nullptr) return;
+    const auto text = node->value_exact<std::string>();
+    if (!text || (!text->empty() && !is_tcp_endpoint(*text)))
+      return refuse(key, *node, "tcp://ADDRESS:PORT, or \"\" for none");
     value = *text;
   }
 
@@ -697,6 +722,7 @@ class Writer {
   }
   void path(const char* key, const fs::path& value) { write_text(key, value.string()); }
   void endpoint(const char* key, const std::string& value) { write_text(key, value); }
+  void remote_endpoint(const char* key, const std::string& value) { write_text(key, value); }
   void camera(const char* key, const std::string& value) { write_text(key, value); }
   void boolean(const char* key, bool value) { text_ << key << " = " << (value ? "true" : "false") << "\n"; }
   template <class Integer>
@@ -761,6 +787,7 @@ class Lister {
   void optional_number(const char* key, const std::optional<double>&, double, double) { add(key); }
   void path(const char* key, const fs::path&) { add(key); }
   void endpoint(const char* key, const std::string&) { add(key); }
+  void remote_endpoint(const char* key, const std::string&) { add(key); }
   void camera(const char* key, const std::string&) { add(key); }
   void boolean(const char* key, bool) { add(key); }
   template <class Integer>
@@ -839,8 +866,12 @@ void check_cameras(const BoothConfig& config, std::vector<ConfigFault>& faults) 
 
 /// What holds between keys.
 void check_together(const BoothConfig& config, std::vector<ConfigFault>& faults) {
-  if (config.api.control == config.api.events)
-    faults.push_back({"api.events", "\"" + config.api.events + "\"", "another endpoint than api.control"});
+  std::set<std::string> endpoints{config.api.control};
+  for (const auto& [path, endpoint] :
+       {std::pair("api.events", config.api.events), std::pair("api.remote_control", config.api.remote_control),
+        std::pair("api.remote_events", config.api.remote_events)})
+    if (!endpoint.empty() && !endpoints.insert(endpoint).second)
+      faults.push_back({path, "\"" + endpoint + "\"", "an endpoint that is not used twice"});
   if (config.booth.state_directory.is_relative())
     faults.push_back({"booth.state_directory", config.booth.state_directory.string(), "an absolute path"});
   check_cameras(config, faults);

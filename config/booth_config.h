@@ -31,8 +31,12 @@ struct IdentityConfig {
 };
 
 struct ApiConfig {
-  std::string control = "ipc:///run/booth/control";
+  std::string control = "ipc:///run/booth/control";  ///< ipc:// or tcp://; the latter is always encrypted
   std::string events = "ipc:///run/booth/events";
+  std::string remote_control;  ///< tcp:// besides the first; empty: none
+  std::string remote_events;
+  std::filesystem::path server_key = "/etc/booth/keys/server.key";  ///< see api/curve_keys.h; of tcp:// endpoints
+  std::filesystem::path client_keys = "/etc/booth/keys/clients";    ///< folder
 };
 
 struct CaptureConfig {

@@ -20,6 +20,8 @@
 #include "config/booth_config.h"
 #include "daemon/api/client.h"
 #include "daemon/api/requests.h"
+#include "daemon/boothctl/command.h"
+#include "daemon/boothctl/keys.h"
 #include "daemon/identifier.h"
 #include "daemon/offline_calibration.h"
 #include "pipeline/calibration/board_pdf.h"
@@ -35,19 +37,9 @@ namespace fs = std::filesystem;
 using Json = nlohmann::json;
 using SteadyClock = std::chrono::steady_clock;
 
-constexpr int exit_ok = 0;
-constexpr int exit_refused = 1;
-constexpr int exit_usage = 2;
-constexpr int exit_unreachable = 3;
 constexpr const char* exit_codes =
     "Exit status: 0 done; 1 the booth refused or it failed; 2 wrong usage; 3 the booth cannot be reached, or does not "
     "answer in time.";
-
-/// Ends the program with a sentence for the operator.
-struct Failure {
-  int status;
-  std::string message;
-};
 
 /// What a terminal should not be made to interpret is shown as '?'.
 std::string printable(std::string text) {
@@ -108,6 +100,23 @@ struct Options {
   std::string control = ApiConfig{}.control, events = ApiConfig{}.events;
   double timeout_s = 5;
   bool json = false;
+  std::string key_file, server_key;  ///< of tcp:// endpoints
+
+  /// @throw Failure
+  std::optional<api::ClientCredentials> credentials() const {
+    if (key_file.empty()) {
+      for (const std::string& endpoint : {control, events})
+        if (endpoint.starts_with("tcp://"))
+          throw Failure{exit_usage, endpoint + ": needs --key, a file that boothctl keys add made"};
+      return std::nullopt;
+    }
+    auto read = api::read_client_credentials(key_file);
+    if (!read) throw Failure{exit_refused, read.error().message};
+    if (!server_key.empty()) read->server_key = server_key;
+    if (!api::is_curve_key(read->server_key))
+      throw Failure{exit_usage, "--server-key: expected the booth's public key, 40 characters in Z85"};
+    return std::move(*read);
+  }
 };
 
 class Operator {
@@ -115,7 +124,7 @@ class Operator {
   explicit Operator(const Options& options)
       : options_(options),
         client_(options.control, options.events,
-                std::chrono::milliseconds(static_cast<int64_t>(1000 * options.timeout_s))) {}
+                std::chrono::milliseconds(static_cast<int64_t>(1000 * options.timeout_s)), options.credentials()) {}
 
   void status();
   void capture(const Json& params, bool wait);
@@ -461,6 +470,9 @@ int main(int argc, char** argv) {
       ->capture_default_str()
       ->check(CLI::Range(0.1, 3600.0));
   app.add_flag("--json", options.json, "answers as JSON, for scripts");
+  app.add_option("--key", options.key_file,
+                 "for tcp:// endpoints: this client's key file, as boothctl keys add makes it");
+  app.add_option("--server-key", options.server_key, "the booth's public key, when it is not that of the key file");
   app.require_subcommand(1);
   app.fallthrough();
 
@@ -573,6 +585,7 @@ int main(int argc, char** argv) {
   calibrate->add_flag("--keep-unseen", calibration.keep_unseen,
                       "cameras that never saw the board keep the recording's calibration");
   calibrate->callback([&] { offline = [&] { booth::calibrate_offline(calibration); }; });
+  booth::add_keys_command(app, options.json, offline);
   auto* projector = app.add_subcommand("projector", "what lights the face with patterns");
   projector->require_subcommand(1);
   projector

@@ -13,6 +13,7 @@
 #include <array>
 #include <cerrno>
 #include <chrono>
+#include <cstdlib>
 #include <exception>
 #include <filesystem>
 #include <iostream>
@@ -103,6 +104,16 @@ void watch(const Booth& booth, const api::Server& server, const SignalDescriptor
   }
 }
 
+/// The server's key, where systemd hands it over: its own copy, which only this service can read.
+void prefer_credential(ApiConfig& api) {
+  const char* const folder = std::getenv("CREDENTIALS_DIRECTORY");
+  if (folder == nullptr) return;
+  const fs::path file = fs::path(folder) / "server.key";
+  std::error_code code;
+  // The unit's default is empty, for a booth without remote clients.
+  if (fs::file_size(file, code) > 0 && !code) api.server_key = file;
+}
+
 int run(const Arguments& arguments) {
   BoothOptions options;
   options.reconstruct_command = arguments.reconstruct_command.empty() ? beside_this_program("booth-reconstruct")
@@ -118,6 +129,7 @@ int run(const Arguments& arguments) {
     options.config = std::move(*config);
   }
   set_up_log(options.config.log.level);
+  prefer_credential(options.config.api);
   if (::access(options.reconstruct_command.c_str(), X_OK) != 0) {
     spdlog::error("{}: cannot be executed", options.reconstruct_command.string());
     return exit_config;

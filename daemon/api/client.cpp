@@ -24,6 +24,12 @@ bool wait_readable(zmq::socket_t& socket, SteadyClock::time_point deadline) {
   return zmq::poll(items.data(), items.size(), std::max(left, std::chrono::milliseconds(0))) > 0;
 }
 
+void encrypt(zmq::socket_t& socket, const ClientCredentials& credentials) {
+  socket.set(zmq::sockopt::curve_serverkey, credentials.server_key);
+  socket.set(zmq::sockopt::curve_publickey, credentials.keys.public_key);
+  socket.set(zmq::sockopt::curve_secretkey, credentials.keys.secret_key);
+}
+
 std::vector<zmq::message_t> receive(zmq::socket_t& socket) {
   std::vector<zmq::message_t> frames;
   do {
@@ -36,11 +42,14 @@ std::vector<zmq::message_t> receive(zmq::socket_t& socket) {
 
 }  // namespace
 
-Client::Client(const std::string& control, const std::string& events, std::chrono::milliseconds patience)
+Client::Client(const std::string& control, const std::string& events, std::chrono::milliseconds patience,
+               const std::optional<ClientCredentials>& credentials)
     : sockets_(std::make_unique<Sockets>()), events_endpoint_(events), patience_(patience) {
   sockets_->control.set(zmq::sockopt::linger, 0);
   sockets_->events.set(zmq::sockopt::linger, 0);
   try {
+    if (credentials) encrypt(sockets_->control, *credentials);
+    if (credentials) encrypt(sockets_->events, *credentials);
     sockets_->control.connect(control);
   } catch (const zmq::error_t& fault) {
     throw std::runtime_error(control + ": " + fault.what());

@@ -8,6 +8,8 @@
 #include <variant>
 #include <vector>
 
+#include "daemon/api/curve_keys.h"
+
 namespace booth::api {
 
 /// Why a call brought no result.
@@ -33,7 +35,9 @@ class Client {
  public:
   /// Connects when the booth is there; endpoints as in the configuration. Throws std::runtime_error for ones that are
   /// none.
-  Client(const std::string& control, const std::string& events, std::chrono::milliseconds patience);
+  /// @param credentials  of tcp:// endpoints, which take nobody without
+  Client(const std::string& control, const std::string& events, std::chrono::milliseconds patience,
+         const std::optional<ClientCredentials>& credentials = std::nullopt);
   ~Client();
 
   std::variant<CallReply, CallError> call(const std::string& method, const nlohmann::json& params);

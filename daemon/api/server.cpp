@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <list>
 #include <map>
 #include <mutex>
 #include <nlohmann/json.hpp>
@@ -17,13 +18,17 @@
 #include <vector>
 #include <zmq.hpp>
 
+#include "daemon/api/curve_keys.h"
 #include "daemon/api/dispatcher.h"
 #include "daemon/api/errors.h"
 #include "daemon/api/event_codec.h"
 #include "daemon/api/json_values.h"
 #include "daemon/api/key_store.h"
 #include "daemon/api/methods.h"
+#include "daemon/api/rate_limiter.h"
 #include "daemon/api/requests.h"
+#include "daemon/api/roles.h"
+#include "daemon/api/zap_handler.h"
 #include "daemon/wakeup.h"
 
 namespace booth::api {
@@ -35,9 +40,12 @@ using Envelope = std::vector<zmq::message_t>;
 
 constexpr size_t most_request_bytes = 64 * 1024;
 /// A frame larger than that is not even received: its connection is closed. In between there is an answer.
-constexpr int64_t most_received_bytes = 1024 * 1024;
+constexpr int64_t most_received_bytes = 128 * 1024;
 constexpr size_t most_envelope_frames = 16;
-constexpr int most_queued_messages = 1000;  ///< per peer
+constexpr int most_queued_messages = 1000;  ///< to a peer
+constexpr int most_queued_requests = 64;    ///< of a peer: what it sends beyond stays with it
+/// Pictures that slow clients have not taken yet; further ones are skipped meanwhile.
+constexpr size_t most_preview_bytes = 64UL * 1024 * 1024;
 /// File pieces that slow clients have not taken yet.
 constexpr size_t most_bytes_in_flight = 128UL * 1024 * 1024;
 constexpr size_t most_pending = 4096;  ///< requests that wait for the disk
@@ -46,6 +54,13 @@ constexpr std::chrono::milliseconds longest_sleep{500};
 /// A request is answered within 100 ms; some of that is spent on the way.
 constexpr std::chrono::milliseconds early_answer{85};
 constexpr std::chrono::milliseconds farewell{200};  ///< for the last answers and events at the end
+// Of remote clients: a stranger who does not come to the point, and a client that is gone without a word, are let go.
+constexpr std::chrono::milliseconds longest_handshake{3000};
+constexpr std::chrono::milliseconds ping_pause{5000};
+constexpr std::chrono::milliseconds longest_silence{15'000};
+constexpr std::chrono::milliseconds bind_again{50};  ///< until an endpoint that was closed is free again
+constexpr RateLimiter::Options request_rates{.per_second = 1000, .burst = 5000};
+constexpr RpcError forbidden{-32009, "forbidden"};
 
 constexpr const char* key_was_used = "key: it was used for another request before";
 
@@ -58,6 +73,7 @@ struct Completions {
 
 /// A request that was carried out, or is being carried out elsewhere.
 struct Pending {
+  zmq::socket_t* socket = nullptr;  ///< that it came from
   Envelope envelope;
   Json id;
   bool notification = false;
@@ -93,24 +109,93 @@ std::optional<std::string> socket_file(const std::string& endpoint) {
   return endpoint.substr(scheme.size());
 }
 
+bool is_remote(const std::string& endpoint) { return endpoint.starts_with("tcp://"); }
+
+/// The endpoints that the configuration names, for requests and for events.
+std::vector<std::string> endpoints_of(const std::string& first, const std::string& remote) {
+  std::vector<std::string> endpoints{first};
+  if (!remote.empty()) endpoints.push_back(remote);
+  return endpoints;
+}
+
+/// A message that counts its bytes until the last client has taken it.
+zmq::message_t counted_message(std::vector<uint8_t> bytes, std::shared_ptr<std::atomic<size_t>> in_flight) {
+  struct Hold {
+    std::vector<uint8_t> bytes;
+    std::shared_ptr<std::atomic<size_t>> in_flight;
+  };
+  auto hold = std::make_unique<Hold>(Hold{std::move(bytes), std::move(in_flight)});
+  *hold->in_flight += hold->bytes.size();
+  void* const data = hold->bytes.data();
+  const size_t size = hold->bytes.size();
+  return {data, size,
+          [](void*, void* hint) {
+            const std::unique_ptr<Hold> held(static_cast<Hold*>(hint));
+            *held->in_flight -= held->bytes.size();
+          },
+          hold.release()};
+}
+
 }  // namespace
 
 struct Server::Content {
+  /// Where requests come in.
+  struct Receiver {
+    bool remote;
+    zmq::socket_t socket;
+  };
+  /// Where events go out.
+  struct Publisher {
+    std::string endpoint;
+    zmq::socket_t socket;
+    bool bound = false;
+  };
+
   Content(const ApiConfig& config, Booth& the_booth, std::shared_ptr<KeyStore> key_store,
-          std::function<void()> shut_down)
-      : booth(the_booth), dispatcher(the_booth, std::move(shut_down)), keys(std::move(key_store)) {
-    control.set(zmq::sockopt::maxmsgsize, most_received_bytes);
-    control.set(zmq::sockopt::router_handover, true);
-    control.set(zmq::sockopt::router_mandatory, true);  // so that a lost reply is seen
-    events.set(zmq::sockopt::maxmsgsize, static_cast<int64_t>(most_request_bytes));
-    bind(control, config.control);
-    bind(events, config.events);
+          std::optional<CurveKeyPair> key_pair, std::function<void()> shut_down)
+      : booth(the_booth),
+        dispatcher(the_booth, std::move(shut_down)),
+        keys(std::move(key_store)),
+        server_keys(std::move(key_pair)) {
+    if (server_keys) {
+      clients.emplace(config.client_keys);
+      closed_revocations = clients->revocations();
+      zap.emplace(context, *clients, booth.metrics());  // before anything is bound
+    }
+    for (const std::string& endpoint : endpoints_of(config.control, config.remote_control)) {
+      zmq::socket_t& socket =
+          receivers.emplace_back(Receiver{is_remote(endpoint), {context, zmq::socket_type::router}}).socket;
+      socket.set(zmq::sockopt::maxmsgsize, most_received_bytes);
+      socket.set(zmq::sockopt::router_handover, true);
+      socket.set(zmq::sockopt::router_mandatory, true);  // so that a lost reply is seen
+      bind(socket, endpoint);
+    }
+    for (const std::string& endpoint : endpoints_of(config.events, config.remote_events)) {
+      publishers.push_back({endpoint, {}, false});
+      open(publishers.back());
+    }
   }
 
-  static void bind(zmq::socket_t& socket, const std::string& endpoint) {
+  void open(Publisher& publisher) {
+    publisher.socket = zmq::socket_t(context, zmq::socket_type::xpub);
+    publisher.socket.set(zmq::sockopt::maxmsgsize, static_cast<int64_t>(most_request_bytes));
+    bind(publisher.socket, publisher.endpoint);
+    publisher.bound = true;
+  }
+
+  void bind(zmq::socket_t& socket, const std::string& endpoint) {
     socket.set(zmq::sockopt::sndhwm, most_queued_messages);
-    socket.set(zmq::sockopt::rcvhwm, most_queued_messages);
+    socket.set(zmq::sockopt::rcvhwm, most_queued_requests);
     socket.set(zmq::sockopt::linger, static_cast<int>(farewell.count()));
+    if (is_remote(endpoint)) {
+      socket.set(zmq::sockopt::curve_server, true);
+      socket.set(zmq::sockopt::curve_secretkey, server_keys->secret_key);
+      socket.set(zmq::sockopt::zap_domain, zap_domain);
+      socket.set(zmq::sockopt::handshake_ivl, static_cast<int>(longest_handshake.count()));
+      socket.set(zmq::sockopt::heartbeat_ivl, static_cast<int>(ping_pause.count()));
+      socket.set(zmq::sockopt::heartbeat_timeout, static_cast<int>(longest_silence.count()));
+      socket.set(zmq::sockopt::ipv6, true);
+    }
     socket.bind(endpoint);
     // The folder's permissions guard the socket; its group may use it.
     constexpr mode_t owner_and_group = 0660;
@@ -120,15 +205,18 @@ struct Server::Content {
 
   void run(const std::stop_token& stop);
   void serve(const std::stop_token& stop);
-  void receive();
-  void accept(Envelope envelope, std::string_view text);
-  std::optional<Refusal> read(const Json& message, Pending& request);
+  void receive(Receiver& receiver);
+  void close_revoked();
+  std::optional<Role> role_of(zmq::message_t& message, std::string& client) const;
+  void accept(zmq::socket_t& control, Envelope envelope, std::string_view text, Role role);
+  std::optional<Refusal> read(const Json& message, Role role, Pending& request);
   void carry_out(Pending request);
   void complete(uint64_t number, const Answer& answer);
   void answer_early();
   void take_completions();
   void answer(Pending& request, const Answer& answer);
-  void send(Envelope& envelope, const std::string& text, std::optional<std::vector<uint8_t>> bytes);
+  void send(zmq::socket_t& control, Envelope& envelope, const std::string& text,
+            std::optional<std::vector<uint8_t>> bytes);
   void publish();
   std::chrono::milliseconds time_to_sleep() const;
 
@@ -139,25 +227,41 @@ struct Server::Content {
   std::shared_ptr<Completions> completions = std::make_shared<Completions>();
   std::shared_ptr<std::atomic<size_t>> bytes_in_flight = std::make_shared<std::atomic<size_t>>(0);
   std::map<uint64_t, Pending> pending;  ///< by number
+  std::shared_ptr<std::atomic<size_t>> preview_bytes = std::make_shared<std::atomic<size_t>>(0);
   uint64_t requests = 0;
+  RateLimiter rates{request_rates};
 
+  const std::optional<CurveKeyPair> server_keys;  ///< where there is a tcp:// endpoint
+  std::optional<ClientDirectory> clients;         ///< likewise
+  uint64_t closed_revocations = 0;                ///< up to there nobody listens whose key was revoked
   zmq::context_t context;
-  zmq::socket_t control{context, zmq::socket_type::router};
-  zmq::socket_t events{context, zmq::socket_type::xpub};
+  std::optional<ZapHandler> zap;
+  std::list<Receiver> receivers;
+  std::list<Publisher> publishers;
   std::jthread thread;
 };
 
 Result<std::unique_ptr<Server>> Server::start(const ApiConfig& config, Booth& booth, std::function<void()> shut_down) {
-  for (const std::string& endpoint : {config.control, config.events})
-    if (!endpoint.starts_with("ipc://") && !endpoint.starts_with("inproc://"))
-      return Error{ErrorCode::invalid_argument, endpoint + ": only ipc:// endpoints are offered by this version"};
+  std::optional<CurveKeyPair> server_keys;
+  for (const std::string& endpoint : {config.control, config.events, config.remote_control, config.remote_events}) {
+    if (!is_remote(endpoint) || server_keys) continue;
+    auto read = read_server_keys(config.server_key);
+    if (!read)
+      return Error{ErrorCode::invalid_argument,
+                   read.error().message + "; " + endpoint + " needs a key: make one with boothctl keys server"};
+    server_keys = std::move(*read);
+  }
   auto keys = KeyStore::open(booth.state_directory() / "keys.jsonl", KeyStore::Clock::now());
   if (!keys) return keys.error();
   try {
-    auto content = std::make_unique<Content>(config, booth, std::move(*keys), std::move(shut_down));
+    auto content =
+        std::make_unique<Content>(config, booth, std::move(*keys), std::move(server_keys), std::move(shut_down));
     return std::unique_ptr<Server>(new Server(std::move(content)));
   } catch (const zmq::error_t& fault) {
-    return Error{ErrorCode::io, config.control + ", " + config.events + ": cannot be bound: " + fault.what()};
+    std::string endpoints = config.control + ", " + config.events;
+    for (const std::string& endpoint : {config.remote_control, config.remote_events})
+      if (!endpoint.empty()) endpoints += ", " + endpoint;
+    return Error{ErrorCode::io, endpoints + ": cannot be bound: " + fault.what()};
   }
 }
 
@@ -172,7 +276,10 @@ Server::~Server() {
   content_->thread.join();
 }
 
-Pulse::TimePoint Server::last_pulse() const { return content_->pulse.last(); }
+Pulse::TimePoint Server::last_pulse() const {
+  const auto last = content_->pulse.last();
+  return content_->zap ? std::min(last, content_->zap->last_pulse()) : last;
+}
 
 void Server::Content::run(const std::stop_token& stop) {
   while (!stop.stop_requested()) {
@@ -194,17 +301,18 @@ void Server::Content::run(const std::stop_token& stop) {
 void Server::Content::serve(const std::stop_token& stop) {
   while (!stop.stop_requested()) {
     pulse.beat();
-    std::array<zmq::pollitem_t, 4> items{{{control.handle(), 0, ZMQ_POLLIN, 0},
-                                          {events.handle(), 0, ZMQ_POLLIN, 0},
-                                          {nullptr, booth.events().wakeup().fd(), ZMQ_POLLIN, 0},
-                                          {nullptr, completions->wakeup.fd(), ZMQ_POLLIN, 0}}};
+    std::vector<zmq::pollitem_t> items{{nullptr, booth.events().wakeup().fd(), ZMQ_POLLIN, 0},
+                                       {nullptr, completions->wakeup.fd(), ZMQ_POLLIN, 0}};
+    for (Receiver& receiver : receivers) items.push_back({receiver.socket.handle(), 0, ZMQ_POLLIN, 0});
+    for (Publisher& publisher : publishers) items.push_back({publisher.socket.handle(), 0, ZMQ_POLLIN, 0});
     try {
       zmq::poll(items.data(), items.size(), time_to_sleep());
     } catch (const zmq::error_t& fault) {
       if (fault.num() != EINTR) throw;
     }
     take_completions();
-    receive();
+    for (Receiver& receiver : receivers) receive(receiver);
+    close_revoked();
     answer_early();
     publish();
   }
@@ -214,11 +322,45 @@ std::chrono::milliseconds Server::Content::time_to_sleep() const {
   auto until = SteadyClock::now() + longest_sleep;
   for (const auto& [number, request] : pending)
     if (request.early) until = std::min(until, request.received + early_answer);
+  for (const Publisher& publisher : publishers)
+    if (!publisher.bound) until = std::min(until, SteadyClock::now() + bind_again);
   return std::max(std::chrono::milliseconds(0),
                   std::chrono::ceil<std::chrono::milliseconds>(until - SteadyClock::now()));
 }
 
-void Server::Content::receive() {
+/// Who is no longer let in hears nothing more either: the connections of its events are closed, those of others too,
+/// which come back by themselves. Requests are checked one by one.
+void Server::Content::close_revoked() {
+  const bool revoked = clients && clients->revocations() != closed_revocations;
+  if (revoked) closed_revocations = clients->revocations();
+  for (Publisher& publisher : publishers) {
+    if (revoked && is_remote(publisher.endpoint)) {
+      publisher.socket.set(zmq::sockopt::linger, 0);
+      publisher.bound = false;
+    }
+    if (publisher.bound) continue;
+    publisher.socket.close();
+    try {
+      open(publisher);
+    } catch (const zmq::error_t& fault) {
+      if (fault.num() != EADDRINUSE) throw;  // it is free in a moment
+    }
+  }
+}
+
+/// @param client  becomes what its requests are counted by
+/// @return nothing: the key with which it connected is no longer let in
+std::optional<Role> Server::Content::role_of(zmq::message_t& message, std::string& client) const {
+  const char* const key = zmq_msg_gets(message.handle(), "User-Id");
+  if (key == nullptr || !clients) return std::nullopt;
+  client = key;
+  const auto found = clients->find(client);
+  if (!found) return std::nullopt;
+  return found->role;
+}
+
+void Server::Content::receive(Receiver& receiver) {
+  zmq::socket_t& control = receiver.socket;
   for (int i = 0; i < requests_in_a_row; ++i) {
     Envelope frames(1);
     if (!control.recv(frames.back(), zmq::recv_flags::dontwait)) break;
@@ -234,19 +376,35 @@ void Server::Content::receive() {
         frames.push_back(std::move(frame));
     }
     if (too_many || frames.size() < 2) continue;  // the first frame is the client's identity
+    std::string client = frames.front().to_string();
+    // Who came over the local socket has passed its folder's permissions.
+    const auto role = receiver.remote ? role_of(frames.back(), client) : Role::operate;
     const std::string text = frames.back().to_string();
     frames.pop_back();
-    accept(std::move(frames), text);
+    if (!role) {
+      booth.metrics().add("requests_failed");
+      send(control, frames, error_text(nullptr, forbidden, "this key is no longer let in: ask the booth's operator"),
+           {});
+    } else if (!rates.take(client, SteadyClock::now())) {
+      // Refused without a look at it, so that it costs next to nothing.
+      booth.metrics().add("requests_over_rate");
+      send(control, frames,
+           error_text(nullptr, rpc_error(ErrorCode::busy), "too many requests in a short time; wait a moment"), {});
+    } else {
+      accept(control, std::move(frames), text, *role);
+    }
   }
   // Subscriptions come in as messages that nobody needs.
   zmq::message_t subscription;
-  while (events.recv(subscription, zmq::recv_flags::dontwait)) {
-  }
+  for (Publisher& publisher : publishers)
+    for (int i = 0; i < requests_in_a_row && publisher.socket.recv(subscription, zmq::recv_flags::dontwait); ++i) {
+    }
 }
 
-void Server::Content::accept(Envelope envelope, std::string_view text) {
+void Server::Content::accept(zmq::socket_t& control, Envelope envelope, std::string_view text, Role role) {
   booth.metrics().add("requests");
   Pending request;
+  request.socket = &control;
   request.envelope = std::move(envelope);
   request.received = SteadyClock::now();
   std::optional<Refusal> refusal;
@@ -255,16 +413,17 @@ void Server::Content::accept(Envelope envelope, std::string_view text) {
         Refusal{invalid_request, "the request has " + std::to_string(text.size()) + " bytes, expected at most 65536"};
   } else {
     const Json message = Json::parse(text, nullptr, false);
-    refusal =
-        message.is_discarded() ? Refusal{parse_error, "the request is not JSON in UTF-8"} : read(message, request);
+    refusal = message.is_discarded() ? Refusal{parse_error, "the request is not JSON in UTF-8"}
+                                     : read(message, role, request);
   }
   if (!refusal) return carry_out(std::move(request));
   booth.metrics().add("requests_failed");
-  if (!request.notification) send(request.envelope, error_text(request.id, refusal->error, refusal->message), {});
+  if (!request.notification)
+    send(control, request.envelope, error_text(request.id, refusal->error, refusal->message), {});
 }
 
 /// Checks what every request has. The notification flag and the id are set where they can be told.
-std::optional<Refusal> Server::Content::read(const Json& message, Pending& request) {
+std::optional<Refusal> Server::Content::read(const Json& message, Role role, Pending& request) {
   if (message.is_array()) return Refusal{invalid_request, "batches are not offered: send one request per message"};
   if (!message.is_object()) return Refusal{invalid_request, "a request is a JSON object"};
   const auto id = message.find("id");
@@ -280,6 +439,10 @@ std::optional<Refusal> Server::Content::read(const Json& message, Pending& reque
   request.notification = id == message.end();
   request.method = find_method(method->get_ref<const std::string&>());
   if (request.method == nullptr) return Refusal{unknown_method, "there is no method " + to_text(*method)};
+  if (!may(role, request.method->method))
+    return Refusal{forbidden, "a key of the role " + std::string(to_string(role)) + " may not call " +
+                                  std::string(request.method->name) + "; the role " +
+                                  std::string(to_string(least_role(request.method->method))) + " may"};
   const RpcError invalid_params = rpc_error(ErrorCode::invalid_argument);
   const auto params = message.find("params");
   request.params = params == message.end() ? Json::object() : *params;
@@ -374,41 +537,30 @@ void Server::Content::answer(Pending& request, const Answer& given) {
     booth.metrics().add("requests_failed");
     spdlog::debug("{}: {}", method, given.error().message);
     if (!request.notification)
-      send(request.envelope, error_text(request.id, rpc_error(given.error().code), given.error().message), {});
+      send(*request.socket, request.envelope,
+           error_text(request.id, rpc_error(given.error().code), given.error().message), {});
     return;
   }
   if (request.key) {
     keys->remember(*request.key, method, request.params, to_text(given->result), KeyStore::Clock::now());
     booth.disk().post([store = keys] { store->sync(); });
   }
-  if (!request.notification) send(request.envelope, result_text(request.id, given->result), given->bytes);
+  if (!request.notification)
+    send(*request.socket, request.envelope, result_text(request.id, given->result), given->bytes);
 }
 
-void Server::Content::send(Envelope& envelope, const std::string& text, std::optional<std::vector<uint8_t>> bytes) {
+void Server::Content::send(zmq::socket_t& control, Envelope& envelope, const std::string& text,
+                           std::optional<std::vector<uint8_t>> bytes) {
   std::optional<zmq::message_t> binary;
   if (bytes) {
     if (*bytes_in_flight + bytes->size() > most_bytes_in_flight) {
       // Not an error of the file: the client may ask again when others have taken theirs.
-      return send(envelope,
+      return send(control, envelope,
                   error_text(Json::parse(text)["id"], rpc_error(ErrorCode::busy),
                              "too many bytes wait for slow clients; try again in a moment"),
                   {});
     }
-    struct Hold {
-      std::vector<uint8_t> bytes;
-      std::shared_ptr<std::atomic<size_t>> in_flight;
-    };
-    auto hold = std::make_unique<Hold>(Hold{std::move(*bytes), bytes_in_flight});
-    *bytes_in_flight += hold->bytes.size();
-    void* const data = hold->bytes.data();
-    const size_t size = hold->bytes.size();
-    binary.emplace(
-        data, size,
-        [](void*, void* hint) {
-          const std::unique_ptr<Hold> held(static_cast<Hold*>(hint));
-          *held->in_flight -= held->bytes.size();
-        },
-        hold.release());
+    binary = counted_message(std::move(*bytes), bytes_in_flight);
   }
   try {
     bool sent = true;
@@ -427,17 +579,28 @@ void Server::Content::send(Envelope& envelope, const std::string& text, std::opt
 
 void Server::Content::publish() {
   booth.events().wakeup().clear();
+  // Never blocks: a subscriber that does not keep up loses events.
+  const auto send = [this](std::array<zmq::message_t, 3> frames, size_t count) {
+    for (Publisher& publisher : publishers) {
+      if (!publisher.bound) continue;
+      for (size_t i = 0; i < count; ++i) {
+        zmq::message_t frame;
+        frame.copy(frames[i]);
+        publisher.socket.send(
+            frame, (i + 1 < count ? zmq::send_flags::sndmore : zmq::send_flags::none) | zmq::send_flags::dontwait);
+      }
+    }
+  };
   for (const NumberedEvent& event : booth.events().take()) {
     const EncodedEvent encoded = encode(event, booth.events().boot());
-    // Never blocks: a subscriber that does not keep up loses events.
-    events.send(zmq::buffer(encoded.topic), zmq::send_flags::sndmore | zmq::send_flags::dontwait);
-    events.send(zmq::buffer(encoded.json), zmq::send_flags::dontwait);
+    send({zmq::message_t(encoded.topic), zmq::message_t(encoded.json)}, 2);
   }
-  for (const PreviewPicture& picture : booth.take_previews()) {
+  for (PreviewPicture& picture : booth.take_previews()) {
+    if (*preview_bytes + picture.jpeg.size() > most_preview_bytes) continue;
     const EncodedEvent encoded = encode(picture, booth.events().boot());
-    events.send(zmq::buffer(encoded.topic), zmq::send_flags::sndmore | zmq::send_flags::dontwait);
-    events.send(zmq::buffer(encoded.json), zmq::send_flags::sndmore | zmq::send_flags::dontwait);
-    events.send(zmq::buffer(picture.jpeg), zmq::send_flags::dontwait);
+    send({zmq::message_t(encoded.topic), zmq::message_t(encoded.json),
+          counted_message(std::move(picture.jpeg), preview_bytes)},
+         3);
   }
 }
 

@@ -336,14 +336,22 @@ TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
 }
 
 TEST(ParseConfig, EndpointsAreLocalAndDifferent) {
-  EXPECT_THAT(faults_of("[api]\ncontrol = \"tcp://0.0.0.0:5555\""),
-              ElementsAre(AllOf(HasSubstr("api.control"), HasSubstr("tcp://0.0.0.0:5555"), HasSubstr("encryption"))));
+  for (const char* endpoint :
+       {"tcp://0.0.0.0:5555", "tcp://*:1", "tcp://booth.local:65535", "tcp://[fe80::1%eth0]:7411"})
+    EXPECT_THAT(faults_of("[api]\nremote_control = \"" + std::string(endpoint) + "\""), IsEmpty()) << endpoint;
+  for (const char* endpoint :
+       {"tcp://", "tcp://1.2.3.4", "tcp://1.2.3.4:0", "tcp://1.2.3.4:65536", "tcp://a b:5", "udp://1.2.3.4:5"})
+    EXPECT_THAT(faults_of("[api]\ncontrol = \"" + std::string(endpoint) + "\""),
+                ElementsAre(AllOf(HasSubstr("api.control"), HasSubstr(endpoint), HasSubstr("tcp://ADDRESS:PORT"))));
+  EXPECT_THAT(faults_of("[api]\nremote_events = \"ipc:///run/x\""), ElementsAre(HasSubstr("api.remote_events")));
+  EXPECT_THAT(faults_of("[api]\nremote_control = \"tcp://*:1\"\nremote_events = \"tcp://*:1\""),
+              ElementsAre(HasSubstr("api.remote_events")));
   for (const char* bad : {"", "ipc://", "ipc://relative", "udp://x", "/run/booth/control"})
     EXPECT_THAT(faults_of("[api]\nevents = \"" + std::string(bad) + "\""), ElementsAre(HasSubstr("ipc:///PATH")))
         << bad;
   EXPECT_THAT(faults_of("[api]\nevents = \"ipc:///" + std::string(200, 'x') + "\""), ElementsAre(HasSubstr("107")));
   EXPECT_THAT(faults_of("[api]\nevents = \"ipc:///a\"\ncontrol = \"ipc:///a\""),
-              ElementsAre(HasSubstr("another endpoint")));
+              ElementsAre(HasSubstr("not used twice")));
 }
 
 TEST(ParseConfig, SaysWhereTheTextStopsBeingToml) {

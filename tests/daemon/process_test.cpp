@@ -191,6 +191,40 @@ TEST_F(Process, BoothctlOperatesIt) {
   EXPECT_TRUE(WIFEXITED(ended) && WEXITSTATUS(ended) == 0);
 }
 
+TEST_F(Process, KeysOpenTheBoothToOtherMachines) {
+  const fs::path keys = folder_.path() / "keys", mine = folder_.path() / "mine.key";
+  EXPECT_EQ(run({BOOTHCTL, "keys", "add", "--folder", keys, "mine"}).first, 1) << "the booth has no key yet";
+  ASSERT_EQ(run({BOOTHCTL, "keys", "server", "--folder", keys}).first, 0);
+  EXPECT_EQ(run({BOOTHCTL, "keys", "server", "--folder", keys}).first, 1) << "not a second time";
+  ASSERT_EQ(run({BOOTHCTL, "keys", "add", "--folder", keys, "--role", "viewer", "--out", mine, "mine"}).first, 0);
+  EXPECT_EQ(run({BOOTHCTL, "keys", "add", "--folder", keys, "--role", "god", "other"}).first, 2);
+  for (const fs::path& secret : {keys / "server.key", mine}) {
+    struct stat status {};
+    ASSERT_EQ(::stat(secret.c_str(), &status), 0);
+    EXPECT_EQ(status.st_mode & 07777U, 0600U) << secret;
+  }
+  options_.config.api.server_key = keys / "server.key";
+  options_.config.api.client_keys = keys / "clients";
+  options_.config.api.remote_control = "tcp://127.0.0.1:" + std::to_string(20000 + ::getpid() % 10000);
+  std::ofstream(config_) << write_config(options_.config);
+  start_boothd();
+  const auto remote = [&](std::vector<std::string> arguments) {
+    arguments.insert(arguments.begin(), {BOOTHCTL, "--control", options_.config.api.remote_control, "--timeout", "30"});
+    return run(arguments);
+  };
+  EXPECT_EQ(remote({"status"}).first, 2) << "without a key";
+  const auto [code, text] = remote({"--key", mine, "--json", "status"});
+  EXPECT_EQ(code, 0);
+  EXPECT_EQ(Json::parse(text)["state"], "idle");
+  EXPECT_EQ(remote({"--key", mine, "shutdown"}).first, 1) << "a viewer may not";
+  EXPECT_EQ(Json::parse(run({BOOTHCTL, "--json", "keys", "list", "--folder", keys}).second)["clients"][0]["role"],
+            "viewer");
+  EXPECT_EQ(run({BOOTHCTL, "keys", "revoke", "--folder", keys, "mine"}).first, 0);
+  EXPECT_EQ(run({BOOTHCTL, "keys", "revoke", "--folder", keys, "mine"}).first, 1);
+  ASSERT_EQ(boothctl({"shutdown"}).first, 0);
+  wait_exit();
+}
+
 TEST_F(Process, RefusesABadConfiguration) {
   EXPECT_EQ(run({BOOTHD, "--config", config_, "--reconstruct", reconstruct_.path(), "--check"}).first, 0);
   std::ofstream(config_) << "[jobs]\nworkers = 0\n[disk]\nreserve = 1\n";

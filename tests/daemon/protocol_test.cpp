@@ -168,9 +168,10 @@ TEST_F(Protocol, EventsCountWithoutGaps) {
   EXPECT_GE(status["sequence"].get<uint64_t>() + 1, expected);
 }
 
-TEST_F(Protocol, OtherEndpointsThanIpcAreRefused) {
+TEST_F(Protocol, TcpWithoutAKeyIsRefused) {
   ApiConfig config = options_.config.api;
   config.control = "tcp://127.0.0.1:5555";
+  config.server_key = folder_.path() / "server.key";
   const auto server = api::Server::start(config, *booth_, [] {});
   ASSERT_FALSE(server);
   EXPECT_EQ(server.error().code, ErrorCode::invalid_argument);

@@ -1,0 +1,19 @@
+#pragma once
+
+#include <string>
+
+namespace booth {
+
+// What every subcommand of boothctl ends with.
+inline constexpr int exit_ok = 0;
+inline constexpr int exit_refused = 1;
+inline constexpr int exit_usage = 2;
+inline constexpr int exit_unreachable = 3;
+
+/// Ends the program with a sentence for the operator.
+struct Failure {
+  int status;
+  std::string message;
+};
+
+}  // namespace booth
