@@ -16,6 +16,7 @@
 #include <cstdlib>
 #include <exception>
 #include <filesystem>
+#include <fstream>
 #include <iostream>
 #include <string>
 #include <system_error>
@@ -109,9 +110,8 @@ void prefer_credential(ApiConfig& api) {
   const char* const folder = std::getenv("CREDENTIALS_DIRECTORY");
   if (folder == nullptr) return;
   const fs::path file = fs::path(folder) / "server.key";
-  std::error_code code;
-  // The unit's default is empty, for a booth without remote clients.
-  if (fs::file_size(file, code) > 0 && !code) api.server_key = file;
+  // A key is a JSON object; the unit's default, for a booth without remote clients, is not.
+  if (std::ifstream(file).peek() == '{') api.server_key = file;
 }
 
 int run(const Arguments& arguments) {
