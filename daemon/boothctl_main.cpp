@@ -21,6 +21,7 @@
 #include "daemon/api/client.h"
 #include "daemon/api/requests.h"
 #include "daemon/boothctl/command.h"
+#include "daemon/boothctl/doctor.h"
 #include "daemon/boothctl/keys.h"
 #include "daemon/identifier.h"
 #include "daemon/offline_calibration.h"
@@ -585,6 +586,7 @@ int main(int argc, char** argv) {
   calibrate->add_flag("--keep-unseen", calibration.keep_unseen,
                       "cameras that never saw the board keep the recording's calibration");
   calibrate->callback([&] { offline = [&] { booth::calibrate_offline(calibration); }; });
+  booth::add_doctor_command(app, options.json, offline);
   booth::add_keys_command(app, options.json, offline);
   auto* projector = app.add_subcommand("projector", "what lights the face with patterns");
   projector->require_subcommand(1);
