@@ -190,6 +190,7 @@ void Booth::open_capture(const Devices& devices) {
       CaptureParts{.config = options_.config.capture,
                    .recordings = options_.config.booth.recordings(),
                    .projector_delay = projector_delay_file(options_.config.booth.state_directory),
+                   .delay_calibration = options_.delay_calibration,
                    .source = devices.source,
                    .trigger = devices.trigger,
                    .projector = devices.projector,

@@ -61,6 +61,7 @@ struct BoothOptions {
   BoothConfig config;
   std::filesystem::path config_file;          ///< handed to the reconstruction; may be empty
   std::filesystem::path reconstruct_command;  ///< see JobRunnerOptions::command
+  DelayCalibrationOptions delay_calibration = {.max_delay_ms = 300, .repeats = 3};  ///< some ten seconds
 };
 
 struct CalibrationStatus {

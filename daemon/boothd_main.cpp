@@ -27,6 +27,7 @@
 #include "daemon/log.h"
 #include "daemon/wakeup.h"
 #include "drivers/clock.h"
+#include "drivers/gpio/gpio_devices.h"
 
 namespace booth {
 namespace {
@@ -41,7 +42,7 @@ constexpr std::chrono::seconds longest_silence{30};
 
 struct Arguments {
   std::string config_file, reconstruct_command;
-  bool check = false;
+  bool check = false, rest = false;
 };
 
 /// Signals that end the service come through a descriptor. To be made before any other thread.
@@ -114,6 +115,18 @@ void prefer_credential(ApiConfig& api) {
   if (std::ifstream(file).peek() == '{') api.server_key = file;
 }
 
+/// What a service that was killed may have left on: the trigger, the lights, a stepped projector's pattern. A display
+/// goes dark by itself when its program ends.
+int bring_to_rest(const BoothConfig& config) {
+  const bool trigger = config.trigger.driver == TriggerDriver::gpio;
+  const bool projector = config.projector.driver == ProjectorDriver::gpio;
+  const auto rested = rest_gpio_lines(trigger ? &config.trigger.gpio : nullptr,
+                                      projector ? &config.projector.gpio : nullptr, MonotonicClock());
+  if (rested) return 0;
+  spdlog::error("{}", rested.error().message);
+  return exit_failed;
+}
+
 int run(const Arguments& arguments) {
   BoothOptions options;
   options.reconstruct_command = arguments.reconstruct_command.empty() ? beside_this_program("booth-reconstruct")
@@ -129,6 +142,7 @@ int run(const Arguments& arguments) {
     options.config = std::move(*config);
   }
   set_up_log(options.config.log.level);
+  if (arguments.rest) return bring_to_rest(options.config);
   prefer_credential(options.config.api);
   if (::access(options.reconstruct_command.c_str(), X_OK) != 0) {
     spdlog::error("{}: cannot be executed", options.reconstruct_command.string());
@@ -178,6 +192,7 @@ int main(int argc, char** argv) {
   app.add_option("--reconstruct", arguments.reconstruct_command,
                  "program that makes avatars; by default booth-reconstruct beside this one");
   app.add_flag("--check", arguments.check, "only check the configuration");
+  app.add_flag("--rest", arguments.rest, "only bring output lines to rest, after a service that was killed");
   app.set_version_flag("--version", BOOTH_VERSION);
   try {
     app.parse(argc, argv);

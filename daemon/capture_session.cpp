@@ -13,7 +13,6 @@
 #include "daemon/collected_camera.h"
 #include "daemon/identifier.h"
 #include "daemon/projector_delay.h"
-#include "drivers/display/delay_calibration.h"
 #include "replay/durable_folder.h"
 #include "replay/recording_file.h"
 
@@ -32,6 +31,9 @@ constexpr double altered_share = 0.03;  ///< of a picture's cells, that say that
 /// A pattern that a camera missed is shown once more while the subject is still there; this many times in a sequence,
 /// lest a bad cable keep somebody standing.
 constexpr int most_repeats = 8;
+/// So long the subject waits for a face camera that was lost in the sequence.
+constexpr Timestamp return_patience = seconds(2);
+constexpr std::chrono::milliseconds return_slice{20};
 
 constexpr const char* background_shot = "background";
 constexpr const char* body_shot = "body";
@@ -44,6 +46,11 @@ std::string join(const std::vector<std::string>& words) {
 }
 
 Error was_cancelled() { return {ErrorCode::cancelled, "the capture was cancelled"}; }
+
+bool has_all(const std::map<std::string, Frame>& frames, const std::vector<std::string>& cameras) {
+  return std::all_of(cameras.begin(), cameras.end(),
+                     [&](const std::string& camera) { return frames.contains(camera); });
+}
 
 double elapsed_s(Timestamp from, Timestamp to) { return static_cast<double>(to - from) / 1e9; }
 
@@ -455,7 +462,8 @@ bool CaptureSession::patterns_wanted(FaceMode mode) {
   return projector || without("it cannot be used: " + projector.error().message);
 }
 
-/// Pattern by pattern. Frames come back with the pattern's index.
+/// Pattern by pattern, and at the end once more those that a camera missed that is back. Frames come back with the
+/// pattern's index.
 Result<std::vector<Frame>> CaptureSession::take_face(const std::string& id, const std::stop_token& cancelled) {
   const auto opened = projector_->get();
   if (!opened) return Error{ErrorCode::device_lost, "the projector cannot be used: " + opened.error().message};
@@ -468,68 +476,105 @@ Result<std::vector<Frame>> CaptureSession::take_face(const std::string& id, cons
   } lit{*opened};
 
   const int patterns = pattern_count(lit.projector->info().pattern);
-  FrameCollector collector = arm(parts_.cameras.ids(CameraRole::face), ShotRole::gray_code, patterns + most_repeats);
-  collector.wait_armed(parts_.clock.now() + arm_patience, cancelled);
-
-  std::vector<Frame> frames;
   int repeats_left = most_repeats;
-  for (int pattern = 0; pattern < patterns; ++pattern) {
-    auto taken = take_pattern(id, *lit.projector, pattern, collector, repeats_left, cancelled);
-    if (!taken) {
-      // One that does not show what it should is opened anew next time, which leaves it dark.
-      if (taken.error().code == ErrorCode::io) {
-        lit.projector = nullptr;
-        projector_->lose(taken.error());
-        return Error{ErrorCode::device_lost, taken.error().message};
-      }
-      return taken.error();
+  std::vector<std::map<std::string, Frame>> delivered(static_cast<size_t>(patterns));  // by pattern and camera
+  const auto take_all = [&](const std::vector<std::string>& cameras, bool again) -> Result<void> {
+    FrameCollector collector = arm(cameras, ShotRole::gray_code, patterns + most_repeats);
+    collector.wait_armed(parts_.clock.now() + arm_patience, cancelled);
+    for (int pattern = 0; pattern < patterns; ++pattern) {
+      auto& frames = delivered[static_cast<size_t>(pattern)];
+      if (has_all(frames, cameras)) continue;
+      const auto taken =
+          take_pattern(id, *lit.projector, {pattern, cameras, again}, frames, collector, repeats_left, cancelled);
+      if (!taken) return taken;
     }
-    for (auto& [camera, frame] : *taken) frames.push_back(std::move(frame));
+    return {};
+  };
+  auto taken = take_all(parts_.cameras.ids(CameraRole::face), false);
+  if (taken)
+    if (const auto returned = wait_returned(delivered, cancelled); !returned.empty()) {
+      taken = take_all(returned, true);
+      // One that is lost again is no worse than one that never came back.
+      if (!taken && taken.error().code == ErrorCode::not_ready) taken = {};
+    }
+  if (!taken && taken.error().code == ErrorCode::io) {
+    // One that does not show what it should is opened anew next time, which leaves it dark.
+    lit.projector = nullptr;
+    projector_->lose(taken.error());
   }
+  if (!taken)
+    return cancelled.stop_requested() ? was_cancelled() : Error{ErrorCode::device_lost, taken.error().message};
+  std::vector<Frame> frames;
+  for (auto& of_pattern : delivered)
+    for (auto& [camera, frame] : of_pattern) frames.push_back(std::move(frame));
   return frames;
 }
 
-/// Shows one pattern and takes it with every face camera; once more, as long as `repeats_left` lasts, where one missed
-/// it. @error io  the projector failed; device_lost  no camera is left that could take it, or the trigger failed
-Result<std::map<std::string, Frame>> CaptureSession::take_pattern(const std::string& id, Projector& projector,
-                                                                  int pattern, FrameCollector& collector,
-                                                                  int& repeats_left, const std::stop_token& cancelled) {
-  const std::vector<std::string> cameras = parts_.cameras.ids(CameraRole::face);
+/// The cameras that missed patterns though they took others, and are online: those that were lost are waited for, as
+/// their frames so far are worth nothing without the rest.
+std::vector<std::string> CaptureSession::wait_returned(const std::vector<std::map<std::string, Frame>>& delivered,
+                                                       const std::stop_token& cancelled) {
+  std::vector<std::string> incomplete;
+  for (const std::string& camera : parts_.cameras.ids(CameraRole::face)) {
+    const auto count =
+        std::count_if(delivered.begin(), delivered.end(), [&](const auto& frames) { return frames.contains(camera); });
+    if (count > 0 && count < static_cast<std::ptrdiff_t>(delivered.size())) incomplete.push_back(camera);
+  }
+  const auto is_away = [&](const std::string& camera) {
+    return parts_.cameras.camera(camera).status().state == DeviceState::offline;
+  };
+  const Timestamp deadline = parts_.clock.now() + return_patience;
+  while (std::any_of(incomplete.begin(), incomplete.end(), is_away) && parts_.clock.now() < deadline) {
+    pulse_.beat();
+    std::unique_lock lock(mutex_);
+    changed_.wait_for(lock, cancelled, return_slice, [] { return false; });
+    if (cancelled.stop_requested()) return {};
+  }
+  incomplete.erase(std::remove_if(incomplete.begin(), incomplete.end(), is_away), incomplete.end());
+  return incomplete;
+}
+
+/// Shows one pattern and takes it with the cameras that have no frame of it yet; once more, as long as `repeats_left`
+/// lasts, where one missed it.
+/// @error io  the projector failed; not_ready  no camera is left that could take it; device_lost  the trigger failed
+Result<void> CaptureSession::take_pattern(const std::string& id, Projector& projector, const WantedPattern& wanted,
+                                          std::map<std::string, Frame>& delivered, FrameCollector& collector,
+                                          int& repeats_left, const std::stop_token& cancelled) {
   const Timestamp begun = parts_.clock.now();
-  std::map<std::string, Frame> delivered;
   ShotTaken report{.capture = id,
                    .role = ShotRole::gray_code,
-                   .index = pattern,
+                   .index = wanted.pattern,
                    .of = pattern_count(projector.info().pattern),
                    .cameras = 0,
                    .missing = {},
-                   .skew_us = 0};
+                   .skew_us = 0,
+                   .retries = wanted.again ? 1 : 0};
   for (;; ++report.retries, --repeats_left) {
     if (cancelled.stop_requested()) return was_cancelled();
     if (collector.reachable() == 0)
-      return Error{ErrorCode::device_lost, "no face camera takes the projected patterns: " + join(cameras)};
-    if (const auto shown = projector.show(pattern); !shown)
+      return Error{ErrorCode::not_ready, "no face camera takes the projected patterns: " + join(wanted.cameras)};
+    if (const auto shown = projector.show(wanted.pattern); !shown)
       return Error{ErrorCode::io, "the projector failed: " + shown.error().message};
     auto shot = fire_and_collect(collector, ShotRole::gray_code, cancelled);
     if (!shot) return shot.error();
     report.skew_us = std::max(report.skew_us, shot->skew_us);
     for (Frame& frame : shot->set.frames) {
-      frame.index = pattern;
+      frame.index = wanted.pattern;
       report.offsets_us.try_emplace(frame.camera, shot->offsets_us[frame.camera]);
       delivered.try_emplace(frame.camera, std::move(frame));
     }
-    const bool worth_it = std::any_of(cameras.begin(), cameras.end(), [&](const std::string& camera) {
+    const bool worth_it = std::any_of(wanted.cameras.begin(), wanted.cameras.end(), [&](const std::string& camera) {
       return !delivered.contains(camera) && collector.is_reachable(camera);
     });
     if (!worth_it || repeats_left == 0) break;
   }
   parts_.metrics.add("shot_retries", report.retries);
   report.cameras = static_cast<int>(delivered.size());
-  for (const std::string& camera : cameras)
+  for (const std::string& camera : parts_.cameras.ids(CameraRole::face))
     if (!delivered.contains(camera)) report.missing.push_back(camera);
   report.decided_ms = 1e3 * elapsed_s(begun, parts_.clock.now());
   parts_.events.publish(report);
-  return delivered;
+  return {};
 }
 
 Result<void> CaptureSession::write(RecordingWriter& writer, const std::string& shot, const std::vector<Frame>& frames,
@@ -673,7 +718,6 @@ Result<TaskResult> CaptureSession::work(const std::string&, const ProjectorCalib
   const std::vector<std::string> faces = parts_.cameras.ids(CameraRole::face);
   if (faces.empty()) return Error{ErrorCode::not_ready, "the booth has no face camera that could see the projector"};
 
-  constexpr DelayCalibrationOptions calibration{.max_delay_ms = 300, .repeats = 3};  // some ten seconds
   // The first that sees it will do.
   Result<DelayCalibration> measured = Error{};
   std::string camera;
@@ -682,7 +726,8 @@ Result<TaskResult> CaptureSession::work(const std::string&, const ProjectorCalib
     camera = id;
     CollectedCamera looking(parts_.cameras, id, arm_patience, milliseconds(parts_.config.max_skew_ms), parts_.clock,
                             cancelled);
-    measured = calibrate_delay(*projector, *trigger, looking, parts_.clock, calibration, [this] { pulse_.beat(); });
+    measured = calibrate_delay(*projector, *trigger, looking, parts_.clock, parts_.delay_calibration,
+                               [this] { pulse_.beat(); });
     if (cancelled.stop_requested()) return was_cancelled();
     if (measured) break;
   }

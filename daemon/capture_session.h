@@ -26,6 +26,7 @@
 #include "daemon/pulse.h"
 #include "daemon/task_board.h"
 #include "drivers/device_source.h"
+#include "drivers/display/delay_calibration.h"
 #include "pipeline/reconstruct.h"
 #include "pipeline/thread_pool.h"
 #include "replay/recording_writer.h"
@@ -54,7 +55,8 @@ struct ProjectorCalibrationRequest {};
 struct CaptureParts {
   CaptureConfig config;
   std::filesystem::path recordings;
-  std::filesystem::path projector_delay;  ///< the file that keeps what was measured
+  std::filesystem::path projector_delay;      ///< the file that keeps what was measured
+  DelayCalibrationOptions delay_calibration;  ///< how it is measured
   std::shared_ptr<DeviceSource> source;
   std::string trigger;                              ///< its driver's name
   std::optional<std::string> projector;             ///< its id, where the booth has one
@@ -134,9 +136,16 @@ class CaptureSession {
                           const std::stop_token& cancelled);
   Result<CollectedShot> take_body(const std::string& id, FrameCollector& collector, const std::stop_token& cancelled);
   Result<std::vector<Frame>> take_face(const std::string& id, const std::stop_token& cancelled);
-  Result<std::map<std::string, Frame>> take_pattern(const std::string& id, Projector& projector, int pattern,
-                                                    FrameCollector& collector, int& repeats_left,
-                                                    const std::stop_token& cancelled);
+  std::vector<std::string> wait_returned(const std::vector<std::map<std::string, Frame>>& delivered,
+                                         const std::stop_token& cancelled);
+  struct WantedPattern {
+    int pattern = 0;
+    const std::vector<std::string>& cameras;  ///< from which
+    bool again = false;                       ///< it was shown before
+  };
+  Result<void> take_pattern(const std::string& id, Projector& projector, const WantedPattern& wanted,
+                            std::map<std::string, Frame>& delivered, FrameCollector& collector, int& repeats_left,
+                            const std::stop_token& cancelled);
   Result<void> write(RecordingWriter& writer, const std::string& shot, const std::vector<Frame>& frames,
                      const std::stop_token& cancelled);
 

@@ -195,4 +195,15 @@ Result<std::unique_ptr<Projector>> open_gpio_projector(const GpioProjectorSettin
   return std::unique_ptr<Projector>(std::move(projector));
 }
 
+Result<void> rest_gpio_lines(const GpioTriggerSettings* trigger, const GpioProjectorSettings* projector,
+                             const Clock& clock, const std::shared_ptr<GpioSystem>& system) {
+  Result<void> rested;
+  // Opening brings to rest what closing leaves so.
+  if (trigger != nullptr)
+    if (const auto opened = open_gpio_trigger(*trigger, clock, system); !opened) rested = opened.error();
+  if (projector != nullptr)
+    if (const auto opened = open_gpio_projector(*projector, clock, system); !opened && rested) rested = opened.error();
+  return rested;
+}
+
 }  // namespace booth

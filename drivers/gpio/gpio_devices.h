@@ -15,8 +15,8 @@ class GpioSystem;
 /// pulses the line, and returns the instant of its active edge once lights and line are back at rest.
 ///
 /// Lines are requested at rest, and brought to rest by the destructor and after every error. When the process is killed
-/// the kernel frees them: what they do then is up to the chip (most keep the last level, some float), so that the
-/// wiring must pull them to rest.
+/// the kernel frees them: chips that have pulls, which are asked for, then pull them to rest; what others do is up to
+/// them (most keep the last level, some float). rest_gpio_lines() is for whoever cleans up after the process.
 /// @param clock   outlives the trigger
 /// @param system  a simulated one for tests; nullptr: this machine's chips
 /// @error invalid_argument  as check(settings), or two lines are the same; not_found  no such line on the chip;
@@ -30,5 +30,11 @@ Result<std::unique_ptr<Trigger>> open_gpio_trigger(const GpioTriggerSettings& se
 /// @error as open_gpio_trigger
 Result<std::unique_ptr<Projector>> open_gpio_projector(const GpioProjectorSettings& settings, const Clock& clock,
                                                        std::shared_ptr<GpioSystem> system = nullptr);
+
+/// Brings lines to rest that a process may have left active, and a stepped projector to where it is dark.
+/// @param trigger, projector  nullptr: there is none
+/// @error as open_gpio_trigger, of the first that cannot be had; the other one is brought to rest all the same
+Result<void> rest_gpio_lines(const GpioTriggerSettings* trigger, const GpioProjectorSettings* projector,
+                             const Clock& clock, const std::shared_ptr<GpioSystem>& system = nullptr);
 
 }  // namespace booth

@@ -63,7 +63,11 @@ class LinuxGpioSystem final : public GpioSystem {
         offset ? gpiod_chip_get_line(chip.get(), *offset) : gpiod_chip_find_line(chip.get(), settings.line.c_str());
     if (line == nullptr)
       return Error{ErrorCode::not_found, name_of(settings) + " does not exist: no line of the chip has that name"};
-    const int flags = settings.active == ActiveLevel::low ? GPIOD_LINE_REQUEST_FLAG_ACTIVE_LOW : 0;
+    // The pull holds the line at rest once nobody drives it any more, which is all that can be had when this process is
+    // killed. Chips without pulls ignore it.
+    const int flags = settings.active == ActiveLevel::low
+                          ? GPIOD_LINE_REQUEST_FLAG_ACTIVE_LOW | GPIOD_LINE_REQUEST_FLAG_BIAS_PULL_UP
+                          : GPIOD_LINE_REQUEST_FLAG_BIAS_PULL_DOWN;
     constexpr int at_rest = 0;
     if (gpiod_line_request_output_flags(line, consumer.c_str(), flags, at_rest) != 0) {
       const int error = errno;

@@ -314,6 +314,28 @@ TEST_F(Live, AFaceCameraThatDiesInTheSequenceLeavesTheOther) {
   EXPECT_THAT(recording(second).find(ShotRole::gray_code)->frames, SizeIs(2 * patterns));
 }
 
+TEST_F(Live, WhatAFaceCameraMissedWhileItWasAwayIsShownAgainAndNothingElse) {
+  begin();
+  fake_->play(only("f1", ShotRole::gray_code, {.kind = Kind::lost}, 3));
+  const std::string id = capture();
+  ASSERT_TRUE(wait_until([&] { return !fake_->see("f1").plugged; }));
+  fake_->play({});
+  fake_->plug_in("f1");
+  ASSERT_EQ(end_of(id), "done") << failure_;
+  EXPECT_THAT(fake_->shown(), ElementsAre(0, 1, 2, 3, 4, 5, 6, 7, 3, 4, 5, 6, 7, -1));
+  const Recording taken = recording(id);
+  ASSERT_THAT(taken.find(ShotRole::gray_code)->frames, SizeIs(2 * patterns));
+  for (const FrameSet& set : load_shot(taken, *taken.find(ShotRole::gray_code)).sets)
+    for (const Frame& frame : set.frames) EXPECT_EQ(frame.pixels->at(3, 3), set.index) << frame.camera;
+  const auto reports = shots(id);
+  ASSERT_THAT(reports, SizeIs(1 + patterns + 5));
+  EXPECT_EQ(reports[1 + 3]["missing"], Json({"f1"}));
+  for (size_t i = 1 + patterns; i < reports.size(); ++i) {
+    EXPECT_THAT(reports[i]["missing"], IsEmpty());
+    EXPECT_EQ(reports[i]["retries"], 1);
+  }
+}
+
 TEST_F(Live, WithoutAnyFaceCameraTheSequenceEndsAtOnce) {
   begin();
   fake_->play([](const std::string& id, ShotRole role, int trigger) {
@@ -469,15 +491,16 @@ TEST_F(Live, TheTriggerTestTellsWhoAnswersAndWhen) {
 }
 
 TEST_F(Live, TheProjectorsDelayIsMeasuredAndKept) {
+  options_.delay_calibration = {.max_delay_ms = 80, .repeats = 1};
   begin();
-  fake_->set_latency(milliseconds(40));
+  fake_->set_latency(milliseconds(20));
   const SeenEvent end = end_of_task(call("projector.calibrate")["task"]);
   ASSERT_EQ(end.fields["state"], "done") << end.fields;
   EXPECT_EQ(end.fields["kind"], "projector_calibration");
   const Json result = end.fields["result"];
   EXPECT_EQ(result["camera"], "f0");
   EXPECT_EQ(result["contrast"], 190);
-  EXPECT_GE(result["measured_us"], 40'000);
+  EXPECT_GE(result["measured_us"], 20'000);
   EXPECT_GE(result["delay_us"], result["measured_us"].get<int>() + 16'000) << "one refresh for safety";
   const auto kept = read_projector_delay(projector_delay_file(options_.config.booth.state_directory));
   ASSERT_TRUE(kept);
@@ -489,6 +512,7 @@ TEST_F(Live, TheProjectorsDelayIsMeasuredAndKept) {
 }
 
 TEST_F(Live, AProjectorThatNoCameraSeesIsNotCalibrated) {
+  options_.delay_calibration = {.max_delay_ms = 10, .repeats = 1};
   begin();
   fake_->set_latency(seconds(100));
   const SeenEvent end = end_of_task(call("projector.calibrate")["task"]);
