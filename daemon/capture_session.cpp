@@ -720,7 +720,7 @@ Result<TaskResult> CaptureSession::work(const std::string&, const ProjectorCalib
 
   // The first that sees it will do.
   Result<DelayCalibration> measured = Error{};
-  std::string camera;
+  std::string camera, why_not;
   for (const std::string& id : faces) {
     pulse_.beat();
     camera = id;
@@ -730,8 +730,9 @@ Result<TaskResult> CaptureSession::work(const std::string&, const ProjectorCalib
                                [this] { pulse_.beat(); });
     if (cancelled.stop_requested()) return was_cancelled();
     if (measured) break;
+    why_not += (why_not.empty() ? "" : "; ") + measured.error().message;
   }
-  if (!measured) return measured.error();
+  if (!measured) return Error{measured.error().code, why_not};
   if (const auto written = write_projector_delay(parts_.projector_delay, {projector->info().id, measured->delay_us,
                                                                           iso8601(std::chrono::system_clock::now())});
       !written)

@@ -27,6 +27,8 @@ constexpr double least_lit = 0.005;
 constexpr int finest_us = 1000;
 /// Twice what bisection needs; a camera that cannot be triggered at will takes pictures when it likes.
 constexpr int most_steps = 24;
+/// Of the delay that was found; each that fails makes it longer.
+constexpr int most_confirmations = 5;
 
 double mean(const Image& image, const std::vector<size_t>& samples) {
   double sum = 0;
@@ -65,14 +67,20 @@ class Calibration {
       else
         too_short_us = std::max(too_short_us, round->offset_us);
     }
-    const int delay_us = enough_us + static_cast<int>(projector_.refresh_ns() / 1000);
-    // Luck may have helped at one of the steps: what is recommended has to hold by itself.
-    round = take_round(delay_us);
-    if (!round) return round.error();
-    if (!round->whole || too_short_us >= enough_us)
-      return Error{ErrorCode::not_ready, camera_.info().id + ": the delay is not steady about " +
-                                             std::to_string(delay_us) + " µs; calibrate again with more repeats"};
-    return DelayCalibration{delay_us, enough_us, reference_.white - reference_.black, pictures_};
+    // Luck may have helped at one of the steps, and instants jitter: what is recommended has to hold by itself, and to
+    // be longer than all that was seen to be too short.
+    for (int confirmation = 0; confirmation < most_confirmations; ++confirmation) {
+      enough_us = std::max(enough_us, too_short_us + finest_us);
+      const int delay_us = enough_us + static_cast<int>(projector_.refresh_ns() / 1000);
+      if (delay_us > longest_us) break;
+      round = take_round(delay_us);
+      if (!round) return round.error();
+      if (round->whole) return DelayCalibration{delay_us, enough_us, reference_.white - reference_.black, pictures_};
+      too_short_us = std::max(too_short_us, round->offset_us);
+    }
+    return Error{ErrorCode::not_ready,
+                 camera_.info().id + ": the delay is not steady: pictures still mixed two patterns " +
+                     std::to_string(too_short_us) + " µs after the flip; does the scene move, or the light flicker?"};
   }
 
  private:

@@ -19,21 +19,23 @@ struct DelayCalibrationOptions {
 
 struct DelayCalibration {
   int delay_us = 0;     ///< what DisplaySettings::delay_us should be: measured, and one refresh period for safety
-  int measured_us = 0;  ///< the shortest delay of which all pictures were whole
+  int measured_us = 0;  ///< the shortest delay from which on all pictures were whole
   double contrast = 0;  ///< mean difference between white and black where the projector's light falls, of 255
   int pictures = 0;     ///< taken
 };
 
 /// Measures how long after a flip the exposure may begin so that the picture holds the new pattern only: the projector
 /// changes between black and white, pictures are taken at ever closer delays (bisection down to a millisecond), and the
-/// shortest delay at which all are whole is confirmed in a last round. The scene must hold still and see the projector;
-/// ambient light may be anything that does not flicker.
+/// shortest delay at which all are whole is confirmed in a last round. Where the instants of pictures are not exact, it
+/// is the shortest beyond all that were seen to mix patterns. The scene must hold still and see the projector; ambient
+/// light may be anything that does not flicker.
 ///
 /// @param trigger  of the camera; nullptr: the camera goes by note_trigger alone
 /// @param camera   not armed; it is stopped at the end. Best with the exposure of Gray-code shots
 /// @param alive    called between pictures; may be empty
 /// @return the projector is dark again, also after an error
-/// @error not_ready  the camera does not see the projector's light, or no delay up to max_delay_ms was long enough;
+/// @error not_ready  the camera does not see the projector's light, or no delay up to max_delay_ms was long enough, or
+///        steady;
 ///        invalid_argument  an option; what projector, trigger and camera return
 /// Source: Sandia National Laboratories, OpenCSP, SOFAST: closing in on the delay until patterns mix.
 Result<DelayCalibration> calibrate_delay(FlippingProjector& projector, Trigger* trigger, Camera& camera,

@@ -517,7 +517,9 @@ TEST_F(Live, AProjectorThatNoCameraSeesIsNotCalibrated) {
   fake_->set_latency(seconds(100));
   const SeenEvent end = end_of_task(call("projector.calibrate")["task"]);
   EXPECT_EQ(end.fields["state"], "failed");
-  EXPECT_EQ(end.fields["error"]["message"], "f1: does not see the light of beamer; darken the booth, or expose longer");
+  EXPECT_EQ(end.fields["error"]["message"],
+            "f0: does not see the light of beamer; darken the booth, or expose longer; "
+            "f1: does not see the light of beamer; darken the booth, or expose longer");
   EXPECT_FALSE(read_projector_delay(projector_delay_file(options_.config.booth.state_directory)));
 }
 

@@ -190,15 +190,17 @@ class SceneCamera final : public Camera {
     if (fails) return Error{ErrorCode::timeout, "face-left: delivered no frame in time"};
     const double level = scene_.ambient + (scene_.seen ? scene_.light * scene_.mean_level(trigger_) : 0);
     return Frame{.camera = info_.id,
-                 .timestamp_ns = trigger_,
+                 .timestamp_ns = trigger_ + (jitter.empty() ? 0 : jitter[taken_++ % jitter.size()]),
                  .pixels = std::make_shared<const Image>(10, 10, 1, static_cast<uint8_t>(level))};
   }
   void stop() noexcept override { armed = false; }
   bool armed = false;
   bool fails = false;
+  std::vector<Timestamp> jitter;  ///< by how much later, picture by picture, it says that it exposed
 
  private:
   Scene& scene_;
+  size_t taken_ = 0;
   CameraInfo info_{"face-left", "test", CameraRole::face, 10, 10};
   Timestamp trigger_ = 0;
 };
@@ -224,6 +226,16 @@ TEST_F(DelayCalibrationTest, FindsTheDelay) {
   EXPECT_NEAR(measured->contrast, 150, 1);
   EXPECT_TRUE(projector.is_dark);
   EXPECT_FALSE(camera.armed);
+}
+
+/// What it recommends is enough though some pictures are older than they say.
+TEST_F(DelayCalibrationTest, IsOnTheSafeSideOfACameraWhoseInstantsJitter) {
+  scene.latency = milliseconds(10);
+  camera.jitter = {0, 0, milliseconds(6), 0, milliseconds(2), milliseconds(8), 0, milliseconds(4)};
+  const auto measured = calibrate_delay(projector, nullptr, camera, clock, quick);
+  ASSERT_TRUE(measured) << measured.error().message;
+  EXPECT_GE(measured->measured_us, 9800);
+  EXPECT_LE(measured->measured_us, 30'000);
 }
 
 TEST_F(DelayCalibrationTest, RefusesACameraThatDoesNotSeeTheProjector) {

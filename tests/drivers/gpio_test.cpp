@@ -208,6 +208,22 @@ TEST_F(Gpio, AProjectorThatFailedStartsOverAndIsDark) {
   }
 }
 
+TEST_F(Gpio, WhatAKilledProcessLeftActiveIsBroughtToRest) {
+  const auto trigger_lines = lit();
+  const auto projector_lines = stepped();
+  gpio->held.clear();
+  ASSERT_TRUE(rest_gpio_lines(&trigger_lines, &projector_lines, *gpio, gpio));
+  EXPECT_TRUE(all_at_rest());
+  EXPECT_EQ(pulses("R"), 1) << "the projector is where it is dark";
+  EXPECT_EQ(pulses("S") + pulses("T") + pulses("L"), 0);
+  EXPECT_TRUE(gpio->held.empty()) << "the service may have them";
+  EXPECT_TRUE(rest_gpio_lines(nullptr, nullptr, *gpio, gpio)) << "there are none";
+  gpio->missing = {"T"};
+  EXPECT_EQ(rest_gpio_lines(&trigger_lines, &projector_lines, *gpio, gpio).error().message,
+            "gpio trigger: line T is gone");
+  EXPECT_EQ(pulses("R"), 2) << "the others all the same";
+}
+
 std::string fault(const auto& settings) {
   const auto checked = check(settings);
   return checked ? "" : checked.error().message;

@@ -18,5 +18,7 @@ struct Screen {
 
 /// Looks at the frame buffer that a card shows now, whoever drew it. Nothing where the output is off.
 std::optional<Screen> look_at(const std::string& card);
+/// Likewise its first pixel alone, which is quick.
+std::optional<uint32_t> look_at_first_pixel(const std::string& card);
 
 }  // namespace booth

@@ -79,6 +79,10 @@ GpioPeer::~GpioPeer() {
 
 int GpioPeer::level(int line) const { return std::stoi(read(device_ + "/sim_gpio" + std::to_string(line) + "/value")); }
 
+void GpioPeer::set_pull(int line, bool up) {
+  write(device_ + "/sim_gpio" + std::to_string(line) + "/pull", up ? "pull-up" : "pull-down");
+}
+
 void GpioPeer::watch() {
   std::ifstream trace(tracing / "trace_pipe");
   std::string line;

@@ -32,6 +32,8 @@ class GpioPeer {
   const std::string& chip() const { return chip_; }  ///< "gpiochip0"
   /// The level of a line now, also of one that nobody holds.
   int level(int line) const;
+  /// What the circuit does to a line that nobody drives.
+  void set_pull(int line, bool up);
   /// All edges of these lines so far, once `count` are there. Fails the test where they never come.
   std::vector<Edge> wait_edges(const std::vector<int>& lines, size_t count);
   void forget_edges();

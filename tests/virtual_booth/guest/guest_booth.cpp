@@ -14,7 +14,7 @@ GuestBooth::GuestBooth() {
                                      [this](const GpioPeer::Edge& edge) {
                                        if (edge.line != trigger_line || edge.level != 1) return;
                                        const std::lock_guard lock(mutex_);
-                                       if (at_trigger_) at_trigger_();
+                                       if (at_trigger_) at_trigger_(edge);
                                        for (UsbCameraPeer* camera : cameras_) camera->expose();
                                      });
 }
@@ -29,7 +29,7 @@ void GuestBooth::unwire(UsbCameraPeer& camera) {
   cameras_.erase(&camera);
 }
 
-void GuestBooth::at_trigger(std::function<void()> action) {
+void GuestBooth::at_trigger(std::function<void(const GpioPeer::Edge&)> action) {
   const std::lock_guard lock(mutex_);
   at_trigger_ = std::move(action);
 }

@@ -27,15 +27,15 @@ class GuestBooth {
   void wire(UsbCameraPeer& camera);
   void unwire(UsbCameraPeer& camera);
   /// Called at each pulse before the cameras expose, in a thread of the peer; an empty one: nothing is.
-  void at_trigger(std::function<void()> action);
+  void at_trigger(std::function<void(const GpioPeer::Edge&)> action);
 
   /// The booth of this program.
   static GuestBooth& instance();
 
  private:
   std::mutex mutex_;
-  std::set<UsbCameraPeer*> cameras_;  ///< guarded by mutex_
-  std::function<void()> at_trigger_;  ///< guarded by mutex_
+  std::set<UsbCameraPeer*> cameras_;                       ///< guarded by mutex_
+  std::function<void(const GpioPeer::Edge&)> at_trigger_;  ///< guarded by mutex_
   std::unique_ptr<GpioPeer> gpio_;
 };
 

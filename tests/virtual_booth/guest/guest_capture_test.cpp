@@ -7,6 +7,7 @@
 
 #include "drivers/display/pattern_image.h"
 #include "pipeline/image/codec.h"
+#include "tests/drivers/aravis_booth.h"
 #include "tests/end_to_end/booth_process.h"
 #include "tests/virtual_booth/guest/display_peer.h"
 #include "tests/virtual_booth/guest/guest_booth.h"
@@ -16,6 +17,9 @@ namespace {
 
 using testing::ElementsAre;
 using testing::IsEmpty;
+using testing::UnorderedElementsAre;
+
+[[maybe_unused]] const auto* const network = testing::AddGlobalTestEnvironment(new OwnNetwork);
 
 constexpr int display_width = 1024, display_height = 768;
 /// An emulated machine is slow, on a busy host very slow.
@@ -49,7 +53,7 @@ class RecordedPerson {
           camera.id, std::vector<UsbCameraPeer::Mode>{{"MJPG", view.intrinsics.width, view.intrinsics.height}});
       cameras_[camera.id]->peer.set_frames({frames(camera.id, ShotRole::body)});
     }
-    GuestBooth::instance().at_trigger([this] { look(); });
+    GuestBooth::instance().at_trigger([this](const GpioPeer::Edge&) { look(); });
   }
   ~RecordedPerson() { GuestBooth::instance().at_trigger({}); }
   RecordedPerson(const RecordedPerson&) = delete;
@@ -184,21 +188,30 @@ class GuestCapture : public testing::Test {
     ADD_FAILURE() << "it never came:\n" << text_of(booth.log());
     return {};
   }
-  void learn_background(RecordedPerson& person, const Recording& recording) {
-    person.show(ShotRole::background);
-    const auto& frames = recording.find(ShotRole::background)->frames;
-    const auto count = std::count_if(frames.begin(), frames.end(),
-                                     [&](const FrameRecord& record) { return record.camera == frames[0].camera; });
-    const std::string task = booth.call("background.learn", {{"frames", count}})["task"];
-    const Json learned = wait_event([&](const SeenEvent& event) {
+  Json wait_end_of_task(const std::string& task) {
+    return wait_event([&](const SeenEvent& event) {
       return event.topic == "task" && event.fields["task"] == task && event.fields["state"] != "running";
     });
+  }
+  using Show = std::function<void(ShotRole)>;
+  void learn_background(const Show& show, std::ptrdiff_t frames) {
+    show(ShotRole::background);
+    const Json learned = wait_end_of_task(booth.call("background.learn", {{"frames", frames}})["task"]);
     ASSERT_EQ(learned["state"], "done") << learned;
     ASSERT_TRUE(wait_until([&] { return booth.not_ready().empty(); })) << booth.call("system.status");
   }
+  void learn_background(RecordedPerson& person, const Recording& recording) {
+    const auto& frames = recording.find(ShotRole::background)->frames;
+    learn_background([&](ShotRole role) { person.show(role); },
+                     std::count_if(frames.begin(), frames.end(),
+                                   [&](const FrameRecord& record) { return record.camera == frames[0].camera; }));
+  }
   Recording capture(RecordedPerson& person) {
-    person.show(ShotRole::body);
-    id = booth.call("capture.start", {{"face", "active"}})["capture"];
+    return capture([&](ShotRole role) { person.show(role); }, "active");
+  }
+  Recording capture(const Show& show, const std::string& face) {
+    show(ShotRole::body);
+    id = booth.call("capture.start", {{"face", face}})["capture"];
     const Json end = wait_event(
         [&](const SeenEvent& event) { return event.topic.starts_with("capture.") && event.fields["capture"] == id; });
     EXPECT_FALSE(end.contains("kind")) << end << text_of(booth.log());
@@ -270,6 +283,171 @@ TEST_F(GuestCapture, BodyAndFaceAreCapturedAndALostFaceCameraComesBack) {
   ASSERT_TRUE(wait_until([&] { return booth.camera("face-right")["state"] == "online"; }, patience))
       << text_of(booth.log());
   expect_same_files(recording, capture(person));
+  EXPECT_EQ(booth.stop(), 0) << text_of(booth.log());
+}
+
+/// Three GigE cameras and three USB ones on one trigger line, and two that are played back.
+class MixedBooth {
+ public:
+  explicit MixedBooth(const Recording& recording) : recording_(recording) {
+    for (const RigCamera& camera : recording.rig.cameras) {
+      const int width = camera.intrinsics.width, height = camera.intrinsics.height;
+      const int number = static_cast<int>(usb.size() + gige.size());
+      if (gige.size() < 3)
+        gige[camera.id] = std::make_shared<GigeCamera>(
+            GigeCameraOptions{.address = virtual_booth::camera_address(number),
+                              .serial = camera.id,
+                              .scenes = {std::make_shared<const Image>(width, height, 3, uint8_t{0})}});
+      else if (usb.size() < 3)
+        usb[camera.id] =
+            std::make_unique<WiredCamera>(camera.id, std::vector<UsbCameraPeer::Mode>{{"MJPG", width, height}});
+    }
+    GuestBooth::instance().at_trigger([this](const GpioPeer::Edge&) {
+      for (const auto& [id, camera] : gige) camera->pulse();
+    });
+  }
+  ~MixedBooth() { GuestBooth::instance().at_trigger({}); }
+  MixedBooth(const MixedBooth&) = delete;
+  MixedBooth& operator=(const MixedBooth&) = delete;
+
+  void show(ShotRole role) {
+    std::map<std::string, std::vector<std::shared_ptr<const Image>>> scenes;
+    std::map<std::string, std::vector<std::vector<uint8_t>>> files;
+    for (const FrameRecord& record : recording_.find(role)->frames) {
+      if (gige.contains(record.camera)) scenes[record.camera].push_back(load_frame(recording_, record)->pixels);
+      if (usb.contains(record.camera)) files[record.camera].push_back(bytes_of(recording_.folder / record.file));
+    }
+    for (const auto& [id, camera] : gige) camera->see(scenes.at(id));
+    for (const auto& [id, camera] : usb) camera->peer.set_frames(files.at(id));
+  }
+  /// The configuration of all cameras, and of the line that triggers them.
+  std::string sections() const {
+    std::stringstream text;
+    text << "[capture]\nframe_timeout_ms = 60000\nmax_skew_ms = 60000\n[projector]\ndriver = \"none\"\n"
+         << "[trigger]\ndriver = \"gpio\"\n[trigger.gpio]\nchip = \"" << GuestBooth::instance().gpio().chip()
+         << "\"\nline = \"camera-trigger\"\n[replay]\nrecording = \"" << recording_.folder.string()
+         << "\"\npace = \"fast\"\n";
+    for (const RigCamera& camera : recording_.rig.cameras) {
+      text << "[[cameras]]\nid = \"" << camera.id << "\"\n";
+      if (gige.contains(camera.id))
+        text << "driver = \"aravis\"\naddress = \"" << gige.at(camera.id)->address()
+             << "\"\nexposure_us = 1000\npixel_format = \"RGB8\"\npacket_size = 1500\n"
+             << "frame_retention_ms = 10000\nsocket_buffer_kib = 4096\n";
+      else if (usb.contains(camera.id))
+        text << "driver = \"v4l2\"\nserial = \"" << camera.id
+             << "\"\nformat = \"mjpg\"\nwidth = " << camera.intrinsics.width
+             << "\nheight = " << camera.intrinsics.height << "\ntrigger = \"line\"\nmax_offset_ms = 60000\n";
+      else
+        text << "driver = \"replay\"\n";
+    }
+    return text.str();
+  }
+
+  std::map<std::string, std::shared_ptr<GigeCamera>> gige;
+  std::map<std::string, std::unique_ptr<WiredCamera>> usb;
+
+ private:
+  const Recording& recording_;
+};
+
+TEST_F(GuestCapture, OneFileMixesDriversOnOneTriggerLine) {
+  if (!no_network_reason().empty()) GTEST_SKIP() << no_network_reason();
+  const auto recording = read_recording(BOOTH_SOURCE_DIR "/replay/recordings/mini");
+  ASSERT_TRUE(recording) << recording.error().message;
+  MixedBooth mixed(*recording);
+  for (const auto& [name, camera] : mixed.usb) ASSERT_TRUE(camera->peer.plug_in()) << name;
+  fs::copy_file(recording->folder / "rig.json", booth.state() / "calibration" / "rig.json");
+  booth.start(mixed.sections(), reconstruct.path());
+  ASSERT_TRUE(wait_until([&] { return booth.all_online(); }, patience)) << text_of(booth.log());
+  ASSERT_NO_FATAL_FAILURE(learn_background([&](ShotRole role) { mixed.show(role); }, 1));
+  const auto take = [&] { return capture([&](ShotRole role) { mixed.show(role); }, "none"); };
+  expect_same_pictures(*recording, take(), {ShotRole::background, ShotRole::body});
+  ASSERT_EQ(booth.shots(id).size(), 1u);
+  EXPECT_THAT(booth.shots(id)[0]["missing"], IsEmpty()) << text_of(booth.log());
+  EXPECT_EQ(booth.shots(id)[0]["retries"], 0);
+
+  // One of each bus fails; the others go on, and both come back.
+  const auto& [gige_id, gige] = *mixed.gige.begin();
+  const auto& [usb_id, usb] = *mixed.usb.begin();
+  gige->power_off();
+  usb->peer.unplug();
+  take();
+  EXPECT_THAT(booth.shots(id).at(0)["missing"].get<std::vector<std::string>>(), UnorderedElementsAre(gige_id, usb_id));
+  gige->power_on();
+  ASSERT_TRUE(usb->peer.plug_in());
+  ASSERT_TRUE(wait_until([&] { return booth.all_online(); }, patience)) << text_of(booth.log());
+  expect_same_pictures(*recording, take(), {ShotRole::background, ShotRole::body});
+  EXPECT_EQ(booth.stop(), 0) << text_of(booth.log());
+}
+
+/// Notes when the display shows white, from its construction on.
+class LightWatch {
+ public:
+  LightWatch() {
+    thread_ = std::jthread([this](const std::stop_token& stop) {
+      while (!stop.stop_requested()) {
+        const bool lit = look_at_first_pixel(GuestBooth::card).value_or(0) != 0;
+        {
+          const std::lock_guard lock(mutex_);
+          if (changes_.empty() || changes_.back().second != lit) changes_.emplace_back(clock_.now(), lit);
+        }
+        std::this_thread::sleep_for(std::chrono::milliseconds(2));
+      }
+    });
+  }
+  bool lit_at(Timestamp when) const {
+    const std::lock_guard lock(mutex_);
+    bool lit = false;
+    for (const auto& [since, now_lit] : changes_)
+      if (since <= when) lit = now_lit;
+    return lit;
+  }
+
+ private:
+  const MonotonicClock clock_;
+  mutable std::mutex mutex_;
+  std::vector<std::pair<Timestamp, bool>> changes_;  ///< guarded by mutex_
+  std::jthread thread_;
+};
+
+/// A projector that takes its time, seen by a camera.
+TEST_F(GuestCapture, TheProjectorsDelayIsMeasuredFromPicturesAndKept) {
+  constexpr Timestamp latency = milliseconds(80);
+  Recording recording = with_face_cameras();
+  RecordedPerson person(recording);
+  ASSERT_NO_FATAL_FAILURE(person.plug_in());
+  ASSERT_NO_FATAL_FAILURE(start(recording));
+  const CalibratedView& view = *recording.rig.find("face-left");
+  const auto picture = [&](uint8_t level) {
+    return encode_jpeg(Image(view.intrinsics.width, view.intrinsics.height, 1, level));
+  };
+  const std::vector<uint8_t> dim = picture(20), bright = picture(200);
+  std::optional<LightWatch> watch(std::in_place);
+  GuestBooth::instance().at_trigger([&](const GpioPeer::Edge& edge) {
+    const bool lit = watch->lit_at(edge.when_us * 1000 - latency);
+    person.camera("face-left").set_frames({lit ? bright : dim});
+  });
+  Json end = Json::object();
+  // On a busy host pictures may be taken so much later than they say that no delay is found: then it is asked again.
+  for (int tries = 0; tries < 3 && end.value("state", "") != "done"; ++tries) {
+    end = wait_end_of_task(booth.call("projector.calibrate")["task"]);
+    std::cout << end << "\n";
+  }
+  ASSERT_EQ(end["state"], "done") << end;
+  const Json result = end["result"];
+  EXPECT_EQ(result["camera"], "face-left");
+  EXPECT_NEAR(result["contrast"].get<double>(), 180, 5);
+  // The kernel says of a flip when its vertical blank will be, up to a refresh after the change is seen.
+  EXPECT_GE(result["measured_us"], 50'000);
+  EXPECT_LE(result["measured_us"], 250'000);
+  EXPECT_GT(result["delay_us"], result["measured_us"]);
+  const Json kept = Json::parse(text_of(booth.state() / "calibration" / "projector.json"));
+  EXPECT_EQ(kept["projector"], "projector");
+  EXPECT_EQ(kept["delay_us"], result["delay_us"]);
+  GuestBooth::instance().at_trigger({});
+  watch.reset();
+  const auto screen = look_at(GuestBooth::card);
+  EXPECT_TRUE(!screen || screen->is_black());
   EXPECT_EQ(booth.stop(), 0) << text_of(booth.log());
 }
 

@@ -13,6 +13,7 @@
 #include <fstream>
 #include <iostream>
 #include <memory>
+#include <stdexcept>
 #include <string>
 #include <thread>
 #include <vector>
@@ -95,6 +96,49 @@ class Guest : public testing::Test {
     EXPECT_TRUE(camera) << camera.error().message;
     return camera ? *std::move(camera) : nullptr;
   }
+};
+
+/// This program, in another process that does what its arguments say until it is killed.
+class OtherProcess {
+ public:
+  explicit OtherProcess(std::vector<std::string> words) {
+    int said[2];
+    if (::pipe2(said, O_CLOEXEC) != 0) throw std::runtime_error("no pipe");
+    posix_spawn_file_actions_t actions;
+    posix_spawn_file_actions_init(&actions);
+    posix_spawn_file_actions_adddup2(&actions, said[1], STDOUT_FILENO);
+    char program[] = "/proc/self/exe";
+    std::vector<char*> arguments{program};
+    for (std::string& word : words) arguments.push_back(word.data());
+    arguments.push_back(nullptr);
+    EXPECT_EQ(::posix_spawn(&process_, program, &actions, nullptr, arguments.data(), environ), 0);
+    posix_spawn_file_actions_destroy(&actions);
+    ::close(said[1]);
+    said_ = said[0];
+  }
+  ~OtherProcess() {
+    kill();
+    ::close(said_);
+  }
+  OtherProcess(const OtherProcess&) = delete;
+  OtherProcess& operator=(const OtherProcess&) = delete;
+
+  /// Waits until it says that it has begun.
+  bool has_begun() const {
+    char sign = 0;
+    return ::read(said_, &sign, 1) == 1;
+  }
+  void kill() {
+    if (process_ == 0) return;
+    ::kill(process_, SIGKILL);
+    int status = 0;
+    EXPECT_EQ(::waitpid(process_, &status, 0), process_);
+    process_ = 0;
+  }
+
+ private:
+  pid_t process_ = 0;
+  int said_ = -1;
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -552,6 +596,55 @@ TEST_F(GpioLines, AProjectorIsSteppedAndReset) {
   EXPECT_EQ(booth.gpio().level(GuestBooth::reset_line), 0);
 }
 
+/// Lines of both levels that a process holds active when it is killed.
+GpioTriggerSettings long_flash(const std::string& chip) {
+  return {.trigger = {.chip = chip, .line = "4", .active = ActiveLevel::low},
+          .pulse_us = 100'000,
+          .lights = GpioLineSettings{.chip = chip, .line = "5"},
+          .lights_hold_us = 1'000'000};
+}
+
+TEST_F(GpioLines, RestWhenTheirProcessIsKilledWhileTheyAreActive) {
+  // Without our pull they would float to the wrong level.
+  booth.gpio().set_pull(4, false);
+  booth.gpio().set_pull(5, true);
+  OtherProcess service({"--flash", booth.gpio().chip()});
+  ASSERT_TRUE(service.has_begun());
+  for (bool seen = false; !seen;) {
+    booth.gpio().forget_edges();
+    booth.gpio().wait_edges({4, 5}, 1);
+    seen = booth.gpio().level(4) == 0 && booth.gpio().level(5) == 1;
+  }
+  service.kill();
+  EXPECT_EQ(booth.gpio().level(4), 1);
+  EXPECT_EQ(booth.gpio().level(5), 0);
+  EXPECT_TRUE(open_gpio_trigger(long_flash(booth.gpio().chip()), clock)) << "and free";
+}
+
+TEST_F(GpioLines, AreBroughtToRestByTheServicesOwnCommand) {
+  const std::filesystem::path file = std::filesystem::temp_directory_path() / "rest.toml";
+  const std::string chip = "chip = \"" + booth.gpio().chip() + "\"\n";
+  std::ofstream(file) << "[trigger]\ndriver = \"gpio\"\n[trigger.gpio]\n"
+                      << chip << "line = \"4\"\nactive = \"low\"\nlights_" << chip
+                      << "lights_line = \"lights\"\n[projector]\ndriver = \"gpio\"\n[projector.gpio]\nstep_" << chip
+                      << "step_line = \"step\"\nreset_" << chip << "reset_line = \"reset\"\n";
+  booth.gpio().set_pull(4, false);
+  booth.gpio().set_pull(GuestBooth::lights_line, true);
+  booth.gpio().set_pull(GuestBooth::step_line, true);
+  ASSERT_EQ(booth.gpio().level(GuestBooth::lights_line), 1) << "left on";
+  EXPECT_EQ(std::system((std::string(BOOTHD) + " --rest --config " + file.string()).c_str()), 0);
+  EXPECT_EQ(booth.gpio().level(4), 1);
+  EXPECT_EQ(booth.gpio().level(GuestBooth::lights_line), 0);
+  EXPECT_EQ(booth.gpio().level(GuestBooth::step_line), 0);
+  // Requested, then on and off: the projector is where it is dark.
+  EXPECT_EQ(booth.gpio().wait_edges({GuestBooth::reset_line}, 3).back().level, 0);
+
+  const auto held = open_gpio_trigger({.trigger = line(GuestBooth::lights_line)}, clock);
+  ASSERT_TRUE(held) << held.error().message;
+  EXPECT_NE(std::system((std::string(BOOTHD) + " --rest --config " + file.string()).c_str()), 0) << "one is held";
+  std::filesystem::remove(file);
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // The display
 
@@ -603,30 +696,15 @@ TEST_F(Display, ShowsEveryPatternPixelByPixelAndIsBlackOtherwise) {
   EXPECT_TRUE(is_dark()) << "after its end";
 }
 
-/// Another process that shows white until it is killed: this program, started with --show-white.
 TEST_F(Display, IsBlackAfterItsProcessWasKilled) {
-  int said[2];
-  ASSERT_EQ(::pipe2(said, O_CLOEXEC), 0);
-  posix_spawn_file_actions_t actions;
-  posix_spawn_file_actions_init(&actions);
-  posix_spawn_file_actions_adddup2(&actions, said[1], STDOUT_FILENO);
-  char program[] = "/proc/self/exe", argument[] = "--show-white";
-  char* arguments[] = {program, argument, nullptr};
-  pid_t child = 0;
-  ASSERT_EQ(::posix_spawn(&child, program, &actions, nullptr, arguments, environ), 0);
-  posix_spawn_file_actions_destroy(&actions);
-  ::close(said[1]);
-  char shown = 0;
-  EXPECT_EQ(::read(said[0], &shown, 1), 1) << "it never showed anything";
-  ::close(said[0]);
+  OtherProcess projector({"--show-white"});
+  EXPECT_TRUE(projector.has_begun()) << "it never showed anything";
   EXPECT_FALSE(is_dark());
   const auto refused = open_display_projector(settings(), clock);
   ASSERT_FALSE(refused);
   EXPECT_EQ(refused.error().code, ErrorCode::busy);
   EXPECT_THAT(refused.error().message, HasSubstr("another program draws on /dev/dri/card0"));
-  ::kill(child, SIGKILL);
-  int status = 0;
-  ASSERT_EQ(::waitpid(child, &status, 0), child);
+  projector.kill();
   EXPECT_TRUE(is_dark());
   EXPECT_TRUE(open(settings())) << "and free";
 }
@@ -698,11 +776,22 @@ int show_white() {
   while (true) ::pause();
 }
 
+int flash(const std::string& chip) {
+  const MonotonicClock clock;
+  const auto trigger = open_gpio_trigger(long_flash(chip), clock);
+  if (!trigger) return EXIT_FAILURE;
+  std::cout << "!" << std::flush;
+  while ((*trigger)->fire()) {
+  }
+  return EXIT_FAILURE;
+}
+
 }  // namespace
 }  // namespace booth
 
 int main(int argc, char** argv) {
   if (argc > 1 && std::string(argv[1]) == "--show-white") return booth::show_white();
+  if (argc > 2 && std::string(argv[1]) == "--flash") return booth::flash(argv[2]);
   testing::InitGoogleTest(&argc, argv);
   if (std::getenv("BOOTH_IN_GUEST") == nullptr) {
     std::cerr << "These tests change the kernel's devices; start them by tests/virtual_booth/guest/run.\n";
