@@ -32,7 +32,7 @@ constexpr double altered_share = 0.03;  ///< of a picture's cells, that say that
 /// lest a bad cable keep somebody standing.
 constexpr int most_repeats = 8;
 /// So long the subject waits for a face camera that was lost in the sequence.
-constexpr Timestamp return_patience = seconds(2);
+constexpr Timestamp return_patience = seconds(3);
 constexpr std::chrono::milliseconds return_slice{20};
 
 constexpr const char* background_shot = "background";
@@ -491,12 +491,14 @@ Result<std::vector<Frame>> CaptureSession::take_face(const std::string& id, cons
     return {};
   };
   auto taken = take_all(parts_.cameras.ids(CameraRole::face), false);
-  if (taken)
-    if (const auto returned = wait_returned(delivered, cancelled); !returned.empty()) {
-      taken = take_all(returned, true);
-      // One that is lost again is no worse than one that never came back.
-      if (!taken && taken.error().code == ErrorCode::not_ready) taken = {};
-    }
+  const Timestamp deadline = parts_.clock.now() + return_patience;
+  while (taken) {
+    const auto returned = wait_returned(delivered, deadline, cancelled);
+    if (returned.empty() || parts_.clock.now() >= deadline) break;
+    taken = take_all(returned, true);
+    // One that is lost again, or only now found to be lost, may come back yet.
+    if (!taken && taken.error().code == ErrorCode::not_ready) taken = {};
+  }
   if (!taken && taken.error().code == ErrorCode::io) {
     // One that does not show what it should is opened anew next time, which leaves it dark.
     lit.projector = nullptr;
@@ -510,10 +512,10 @@ Result<std::vector<Frame>> CaptureSession::take_face(const std::string& id, cons
   return frames;
 }
 
-/// The cameras that missed patterns though they took others, and are online: those that were lost are waited for, as
-/// their frames so far are worth nothing without the rest.
+/// The cameras that missed patterns though they took others, and are online: those that were lost are waited for until
+/// `deadline`, as their frames so far are worth nothing without the rest.
 std::vector<std::string> CaptureSession::wait_returned(const std::vector<std::map<std::string, Frame>>& delivered,
-                                                       const std::stop_token& cancelled) {
+                                                       Timestamp deadline, const std::stop_token& cancelled) {
   std::vector<std::string> incomplete;
   for (const std::string& camera : parts_.cameras.ids(CameraRole::face)) {
     const auto count =
@@ -523,7 +525,6 @@ std::vector<std::string> CaptureSession::wait_returned(const std::vector<std::ma
   const auto is_away = [&](const std::string& camera) {
     return parts_.cameras.camera(camera).status().state == DeviceState::offline;
   };
-  const Timestamp deadline = parts_.clock.now() + return_patience;
   while (std::any_of(incomplete.begin(), incomplete.end(), is_away) && parts_.clock.now() < deadline) {
     pulse_.beat();
     std::unique_lock lock(mutex_);

@@ -136,7 +136,7 @@ class CaptureSession {
                           const std::stop_token& cancelled);
   Result<CollectedShot> take_body(const std::string& id, FrameCollector& collector, const std::stop_token& cancelled);
   Result<std::vector<Frame>> take_face(const std::string& id, const std::stop_token& cancelled);
-  std::vector<std::string> wait_returned(const std::vector<std::map<std::string, Frame>>& delivered,
+  std::vector<std::string> wait_returned(const std::vector<std::map<std::string, Frame>>& delivered, Timestamp deadline,
                                          const std::stop_token& cancelled);
   struct WantedPattern {
     int pattern = 0;

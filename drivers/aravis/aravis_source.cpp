@@ -127,9 +127,9 @@ Error absent(const AravisCameraSettings& settings) {
 }
 
 Result<GObjectPtr<ArvDevice>> open_gige(const AravisCameraSettings& settings, in_addr address) {
-  if (!gvcp_answers(address, locate_patience)) return absent(settings);
   const auto own = own_address_towards(address);
   if (!own) return Error{ErrorCode::device_lost, "camera " + settings.id + ": " + own.error().message};
+  if (!gvcp_answers(address, locate_patience)) return absent(settings);
   const GObjectPtr<GInetAddress> interface(
       g_inet_address_new_from_bytes(reinterpret_cast<const guint8*>(&own->s_addr), G_SOCKET_FAMILY_IPV4));
   const GObjectPtr<GInetAddress> device(

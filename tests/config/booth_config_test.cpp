@@ -286,6 +286,252 @@ TEST(ParseConfig, TriggersAndProjectorsMustFitTheCameras) {
                           "software and action are for \"aravis\""));
 }
 
+/// A value that will not do, and what is said that would.
+struct BadValue {
+  std::string key;    ///< as config_keys() has it
+  std::string with;   ///< the driver of a camera
+  std::string value;  ///< as TOML
+  std::string expected;
+};
+
+std::vector<BadValue> bad_values() {
+  const std::string short_text = "a text of at most 64 bytes on one line",
+                    path = "a text of at most 4000 bytes on one line";
+  const std::string some_text = "a text of 1 … 64 bytes on one line", truth = "true or false";
+  const std::string id = "an id: 1 … 64 letters, digits, '-', '_' and '.', not beginning with '.'";
+  const std::string level = "one of \"high\", \"low\"", pattern_side = "0 … 16384";
+  const std::string formats = "one of \"Mono8\", \"BayerRG8\", \"BayerGR8\", \"BayerGB8\", \"BayerBG8\", \"RGB8\"";
+  const std::string usb_formats =
+      "one of \"auto\", \"mjpg\", \"yuyv\", \"grey\", \"rggb\", \"grbg\", \"gbrg\", \"bggr\"";
+  const std::string edges = "one of \"rising_edge\", \"falling_edge\", \"any_edge\", \"level_high\", \"level_low\"";
+  return {
+      {"capture.frame_timeout_ms", "", "49", "50 … 60000"},
+      {"capture.retries", "", "6", "0 … 5"},
+      {"capture.max_skew_ms", "", "0", "1 … 60000"},
+      {"capture.min_cameras", "", "0", "1 … 256"},
+      {"capture.background_frames", "", "101", "1 … 100"},
+      {"capture.image_format", "", "\"tiff\"", "one of \"png\", \"jpeg\""},
+      {"capture.png_level", "", "10", "0 … 9"},
+      {"capture.jpeg_quality", "", "0", "1 … 100"},
+      {"capture.keep_encoded", "", "1", truth},
+      {"cameras[].id", "replay", "\"a b\"", id},
+      {"cameras[].id", "aravis", "\".a\"", id},
+      {"cameras[].id", "v4l2", "7", id},
+      {"cameras[].driver", "", "\"usb\"", "one of \"replay\", \"aravis\", \"v4l2\""},
+      {"cameras[].driver", "", "3", "one of \"replay\", \"aravis\", \"v4l2\""},
+      {"cameras[].driver", "", "\"\"", "one of \"replay\", \"aravis\", \"v4l2\""},
+      {"cameras[].role", "replay", "\"head\"", "one of \"body\", \"face\""},
+      {"cameras[].role", "aravis", "\"head\"", "one of \"body\", \"face\""},
+      {"cameras[].role", "v4l2", "\"head\"", "one of \"body\", \"face\""},
+      {"cameras[].mount_rotation", "replay", "90", "one of \"0\", \"90\", \"180\", \"270\""},
+      {"cameras[].mount_rotation", "aravis", "\"45\"", "one of \"0\", \"90\", \"180\", \"270\""},
+      {"cameras[].mount_rotation", "v4l2", "\"45\"", "one of \"0\", \"90\", \"180\", \"270\""},
+      {"cameras[].serial", "aravis", "12345", short_text},
+      {"cameras[].address", "aravis", "[\"10.0.0.1\"]", short_text},
+      {"cameras[].exposure_us", "aravis", "0.5", "1 … 10000000"},
+      {"cameras[].gain_db", "aravis", "-1", "0 … 60"},
+      {"cameras[].pattern_exposure_us", "aravis", "20000000.0", "1 … 10000000"},
+      {"cameras[].pattern_gain_db", "aravis", "61", "0 … 60"},
+      {"cameras[].white_balance_red", "aravis", "0", "0.1 … 16"},
+      {"cameras[].white_balance_blue", "aravis", "nan", "0.1 … 16"},
+      {"cameras[].response", "aravis", "\"log\"", "one of \"linear\", \"srgb\""},
+      {"cameras[].pixel_format", "aravis", "\"Mono10\"", formats},
+      {"cameras[].region_x", "aravis", "-2", "0 … 65535"},
+      {"cameras[].region_y", "aravis", "65536", "0 … 65535"},
+      {"cameras[].region_width", "aravis", "-1", "0 … 65535"},
+      {"cameras[].region_height", "aravis", "70000", "0 … 65535"},
+      {"cameras[].trigger", "aravis", "\"stream\"", "one of \"line\", \"software\", \"action\""},
+      {"cameras[].trigger_line", "aravis", "\"\"", some_text},
+      {"cameras[].trigger_selector", "aravis", "1", some_text},
+      {"cameras[].activation", "aravis", "\"rising\"", edges},
+      {"cameras[].trigger_delay_us", "aravis", "-1", "0 … 1000000"},
+      {"cameras[].action", "aravis", "32", "0 … 31"},
+      {"cameras[].preview_fps", "aravis", "0", "1 … 60"},
+      {"cameras[].packet_size", "aravis", "16385", "0 … 16384"},
+      {"cameras[].packet_delay_ns", "aravis", "-1", "0 … 1000000000"},
+      {"cameras[].packet_resend", "aravis", "\"yes\"", truth},
+      {"cameras[].resend_ratio", "aravis", "1.5", "0 … 1"},
+      {"cameras[].packet_timeout_ms", "aravis", "0", "1 … 1000"},
+      {"cameras[].frame_retention_ms", "aravis", "0", "1 … 10000"},
+      {"cameras[].socket_buffer_kib", "aravis", "63", "64 … 1048576"},
+      {"cameras[].packet_socket", "aravis", "0", truth},
+      {"cameras[].buffers", "aravis", "257", "0 … 256"},
+      {"cameras[].heartbeat_ms", "aravis", "1999", "2000 … 60000"},
+      {"cameras[].ptp", "aravis", "\"on\"", truth},
+      {"cameras[].features", "aravis", "[\"Gain\"]", "an array of texts NAME=VALUE"},
+      {"cameras[].device", "v4l2", "0", path},
+      {"cameras[].serial", "v4l2", "12345", short_text},
+      {"cameras[].bus", "v4l2", "false", short_text},
+      {"cameras[].format", "v4l2", "\"h264\"", usb_formats},
+      {"cameras[].width", "v4l2", "-1", "0 … 65535"},
+      {"cameras[].height", "v4l2", "65536", "0 … 65535"},
+      {"cameras[].fps", "v4l2", "1001", "0 … 1000"},
+      {"cameras[].exposure_us", "v4l2", "99", "100 … 10000000"},
+      {"cameras[].gray_code_exposure_us", "v4l2", "10000001", "100 … 10000000"},
+      {"cameras[].gain", "v4l2", "-1", "0 … 1000000"},
+      {"cameras[].white_balance_k", "v4l2", "999", "1000 … 20000"},
+      {"cameras[].focus", "v4l2", "1000001", "0 … 1000000"},
+      {"cameras[].controls", "v4l2", "[\"gain=much\"]", "an array of texts NAME=VALUE"},
+      {"cameras[].trigger", "v4l2", "\"software\"", "one of \"stream\", \"line\""},
+      {"cameras[].buffers", "v4l2", "1", "2 … 32"},
+      {"cameras[].warm_up_frames", "v4l2", "101", "0 … 100"},
+      {"cameras[].latency_us", "v4l2", "-1", "0 … 1000000"},
+      {"cameras[].max_offset_ms", "v4l2", "0", "1 … 60000"},
+      {"trigger.driver", "", "\"usb\"", "one of \"replay\", \"gpio\", \"aravis\", \"none\""},
+      {"trigger.gpio.chip", "", "0", path},
+      {"trigger.gpio.line", "", "4", short_text},
+      {"trigger.gpio.active", "", "1", level},
+      {"trigger.gpio.pulse_us", "", "9", "10 … 100000"},
+      {"trigger.gpio.lights_chip", "", "0", path},
+      {"trigger.gpio.lights_line", "", "5", short_text},
+      {"trigger.gpio.lights_active", "", "\"on\"", level},
+      {"trigger.gpio.lights_lead_us", "", "-1", "0 … 1000000"},
+      {"trigger.gpio.lights_hold_us", "", "1000001", "0 … 1000000"},
+      {"trigger.gpio.lit", "", "\"body\"",
+       "an array of words, each one of \"background\", \"body\", \"gray_code\", \"calibration_board\""},
+      {"trigger.action.device_key", "", "-1", "0 … 4294967295"},
+      {"trigger.action.group_key", "", "4294967296", "0 … 4294967295"},
+      {"trigger.action.group_mask", "", "0", "1 … 4294967295"},
+      {"trigger.action.destinations", "", "\"10.0.0.255\"", "an array of at most 64 texts of 1 … 64 bytes"},
+      {"trigger.action.schedule_ahead_us", "", "1000001", "0 … 1000000"},
+      {"trigger.action.acknowledge_timeout_ms", "", "0", "1 … 10000"},
+      {"projector.driver", "", "\"hdmi\"", "one of \"replay\", \"display\", \"gpio\", \"none\""},
+      {"projector.gpio.id", "", "\"\"", id},
+      {"projector.gpio.pattern_width", "", "16385", pattern_side},
+      {"projector.gpio.pattern_height", "", "-1", pattern_side},
+      {"projector.gpio.pattern_columns", "", "1", truth},
+      {"projector.gpio.pattern_rows", "", "1", truth},
+      {"projector.gpio.pattern_inverse", "", "1", truth},
+      {"projector.gpio.step_chip", "", "0", path},
+      {"projector.gpio.step_line", "", "2", short_text},
+      {"projector.gpio.step_active", "", "true", level},
+      {"projector.gpio.reset_chip", "", "0", path},
+      {"projector.gpio.reset_line", "", "3", short_text},
+      {"projector.gpio.reset_active", "", "true", level},
+      {"projector.gpio.pulse_us", "", "100001", "10 … 100000"},
+      {"projector.gpio.pause_us", "", "9", "10 … 1000000"},
+      {"projector.gpio.settle_us", "", "-1", "0 … 1000000"},
+      {"projector.display.id", "", "\"a/b\"", id},
+      {"projector.display.card", "", "0", path},
+      {"projector.display.connector", "", "1", short_text},
+      {"projector.display.width", "", "16385", pattern_side},
+      {"projector.display.height", "", "-1", pattern_side},
+      {"projector.display.refresh_hz", "", "1001", "0 … 1000"},
+      {"projector.display.pattern_width", "", "-1", pattern_side},
+      {"projector.display.pattern_height", "", "1.5", "a whole number, 0 … 16384"},
+      {"projector.display.pattern_columns", "", "1", truth},
+      {"projector.display.pattern_rows", "", "1", truth},
+      {"projector.display.pattern_inverse", "", "1", truth},
+      {"projector.display.delay_us", "", "1000001", "0 … 1000000"},
+      {"projector.display.brightness", "", "0", "0.01 … 1"},
+      {"projector.display.gamma", "", "0.5", "1 … 4"},
+  };
+}
+
+TEST(ParseConfig, EverySettingOfTheDevicesSaysWhatItExpects) {
+  std::vector<std::string> tried;
+  for (const BadValue& bad : bad_values()) {
+    tried.push_back(bad.key);
+    const size_t dot = bad.key.rfind('.');
+    const std::string key = bad.key.substr(dot + 1);
+    std::string section = "[" + bad.key.substr(0, dot) + "]\n", where = bad.key;
+    if (bad.key.starts_with("cameras[]")) {
+      section = "[[cameras]]\n";
+      where = "cameras[0]." + key;
+      if (!bad.with.empty()) section += "driver = \"" + bad.with + "\"\n";
+      if (key != "id") section += "id = \"a\"\n";
+    }
+    EXPECT_THAT(faults_of(section + key + " = " + bad.value + "\n"),
+                ElementsAre(where + ": " + (bad.value.starts_with("[") ? "an array" : bad.value) + ", expected " +
+                            bad.expected));
+  }
+  std::vector<std::string> all;
+  for (const std::string& key : config_keys())
+    for (const char* section : {"capture.", "cameras[].", "trigger.", "projector."})
+      if (key.starts_with(section)) all.push_back(key);
+  std::sort(all.begin(), all.end());
+  std::sort(tried.begin(), tried.end());
+  EXPECT_EQ(tried, all) << "a camera's keys once for each driver that has them";
+}
+
+/// What is wrong only together with another setting.
+TEST(ParseConfig, SettingsThatDoNotGoTogetherAreNamed) {
+  const std::string none = "[projector]\ndriver = \"none\"\n[trigger]\ndriver = \"none\"\n";
+  const auto aravis = [&](const std::string& keys) {
+    return faults_of(none + "[[cameras]]\nid = \"a\"\ndriver = \"aravis\"\n" + keys);
+  };
+  EXPECT_THAT(aravis(""),
+              ElementsAre("cameras: camera a: serial: \"\" with address \"\", expected either a serial number "
+                          "or an address"));
+  EXPECT_THAT(
+      aravis("serial = \"1\"\naddress = \"10.0.0.1\""),
+      ElementsAre("cameras: camera a: serial: \"1\" with address \"10.0.0.1\", expected either a serial number or "
+                  "an address"));
+  EXPECT_THAT(aravis("serial = \"1\"\npacket_size = 100"),
+              ElementsAre("cameras: camera a: packet_size: 100, expected 576 … 16384"));
+  EXPECT_THAT(aravis("serial = \"1\"\nbuffers = 1"), ElementsAre("cameras: camera a: buffers: 1, expected 2 … 256"));
+  EXPECT_THAT(aravis("serial = \"1\"\ntrigger_line = \"Line 1\""),
+              ElementsAre("cameras: camera a: trigger_line: \"Line 1\", expected a line's name such as Line1"));
+  EXPECT_THAT(aravis("serial = \"1\"\ntrigger_selector = \"Frame Start\""),
+              ElementsAre("cameras: camera a: trigger_selector: \"Frame Start\", expected a trigger's name such as "
+                          "FrameStart"));
+  EXPECT_THAT(
+      aravis("serial = \"1\"\nfeatures = [\"Line Debouncer=1\"]"),
+      ElementsAre("cameras: camera a: features: \"Line Debouncer\", expected a feature's name of letters, digits "
+                  "and '_'"));
+  EXPECT_THAT(aravis("serial = \"1\"\n[[cameras]]\nid = \"b\"\ndriver = \"aravis\"\nserial = \"1\""),
+              ElementsAre("cameras: camera b: serial: serial 1, expected a device that no other camera is"));
+  const std::string action =
+      "[projector]\ndriver = \"none\"\n[[cameras]]\nid = \"a\"\ndriver = \"aravis\"\nserial = "
+      "\"1\"\ntrigger = \"action\"\n[trigger]\ndriver = \"aravis\"\n[trigger.action]\n";
+  EXPECT_THAT(faults_of(action + "destinations = []"),
+              ElementsAre("cameras: action: destinations: 0 of them, expected 1 … 64"));
+  EXPECT_THAT(faults_of(action + "schedule_ahead_us = 999"),
+              ElementsAre("cameras: action: schedule_ahead_us: 999, expected 1000 … 1000000"));
+
+  const auto v4l2 = [&](const std::string& keys) {
+    return faults_of(none + "[[cameras]]\nid = \"a\"\ndriver = \"v4l2\"\n" + keys);
+  };
+  EXPECT_THAT(v4l2(""), ElementsAre("cameras: a: exactly one of device, serial and bus must be set"));
+  EXPECT_THAT(v4l2("bus = \"usb-1\"\nserial = \"1\""),
+              ElementsAre("cameras: a: exactly one of device, serial and bus must be set"));
+  EXPECT_THAT(v4l2("serial = \"1\"\nwidth = 640"), ElementsAre("cameras: a: width and height must be set together"));
+  EXPECT_THAT(v4l2("serial = \"1\"\nexposure_us = 150"),
+              ElementsAre("cameras: a: exposure_us is 150, expected a multiple of 100 in 100 … 10000000"));
+  EXPECT_THAT(v4l2("serial = \"1\"\ngray_code_exposure_us = 150"),
+              ElementsAre("cameras: a: gray_code_exposure_us is 150, expected a multiple of 100 in 100 … 10000000"));
+
+  const auto trigger = [](const std::string& keys) {
+    return faults_of("[trigger]\ndriver = \"gpio\"\n[trigger.gpio]\n" + keys);
+  };
+  EXPECT_THAT(trigger("line = \"4\""), ElementsAre("trigger.gpio: gpio.trigger: chip is empty, expected a GPIO chip"));
+  EXPECT_THAT(trigger("chip = \"0\""),
+              ElementsAre("trigger.gpio: gpio.trigger: line is empty, expected its offset or its name"));
+  EXPECT_THAT(trigger("chip = \"0\"\nline = \"4\"\nlights_line = \"5\""),
+              ElementsAre("trigger.gpio: gpio.lights: chip is empty, expected a GPIO chip"));
+  EXPECT_THAT(trigger("chip = \"0\"\nline = \"4\"\nlights_chip = \"0\"\nlights_line = \"4\""),
+              ElementsAre("trigger.gpio: gpio.trigger and gpio.lights are both line 4 of 0"));
+
+  const auto stepped = [](const std::string& keys) {
+    return faults_of("[projector]\ndriver = \"gpio\"\n[projector.gpio]\nstep_chip = \"0\"\nstep_line = \"1\"\n" + keys);
+  };
+  EXPECT_THAT(stepped(""), ElementsAre("projector.gpio: projector.reset: chip is empty, expected a GPIO chip"));
+  EXPECT_THAT(stepped("reset_chip = \"0\"\nreset_line = \"1\""),
+              ElementsAre("projector.gpio: projector.step and projector.reset are both line 1 of 0"));
+  EXPECT_THAT(stepped("reset_chip = \"0\"\nreset_line = \"2\"\npattern_width = 0"),
+              ElementsAre("projector.gpio: projector: width is 0, expected 1 … 16384"));
+
+  const auto display = [](const std::string& keys) {
+    return faults_of("[projector]\ndriver = \"display\"\n[projector.display]\n" + keys);
+  };
+  EXPECT_THAT(display("width = 640"),
+              ElementsAre("projector.display: projector: width and height must be set together"));
+  EXPECT_THAT(display("pattern_height = 480"),
+              ElementsAre("projector.display: projector: width and height must be set together"));
+  EXPECT_THAT(display("pattern_columns = false\npattern_rows = false"),
+              ElementsAre("projector.display: projector: the pattern has neither columns nor rows"));
+}
+
 TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
   EXPECT_THAT(
       faults_of(R"(

@@ -448,6 +448,54 @@ TEST_F(AravisSuite, SaysWhereNothingAnswers) {
   }
 }
 
+TEST_F(AravisSuite, SaysThatNoNetworkLeadsThere) {
+  settings.cameras.push_back({.id = "cam-0", .address = "10.9.8.7"});
+  const Error error = refusal();
+  EXPECT_EQ(error.code, ErrorCode::device_lost);
+  EXPECT_EQ(error.message, "camera cam-0: no network leads to 10.9.8.7: Network is unreachable");
+  settings.cameras[0].trigger = AravisTriggerSource::action;
+  settings.action.destinations = {"10.9.8.255"};
+  create_source();
+  const auto trigger = source->open_trigger();
+  ASSERT_TRUE(trigger) << trigger.error().message;
+  const auto fired = (*trigger)->fire();
+  ASSERT_FALSE(fired);
+  EXPECT_EQ(fired.error().code, ErrorCode::device_lost);
+  EXPECT_EQ(fired.error().message, "the action command cannot be sent: Network is unreachable");
+}
+
+TEST_F(AravisSuite, ACameraIsOpenedOnceAndOnlyWhereItIsConfigured) {
+  add_camera();
+  const auto camera = open();
+  ASSERT_TRUE(camera);
+  EXPECT_EQ(refusal().message, "camera cam-0 is open already");
+  EXPECT_EQ(source->open_camera("other").error().message, "no camera other is configured");
+  EXPECT_EQ(source->open_trigger().error().message,
+            "every camera is triggered by its line, which another driver pulses");
+  EXPECT_EQ(camera->arm({.role = ShotRole::body}, 0).error().message, "camera cam-0: cannot be armed for 0 frames");
+  EXPECT_EQ(camera->wait_frame(soon()).error().message, "camera cam-0: is not armed");
+  ASSERT_TRUE(arm(*camera, 1));
+  EXPECT_EQ(camera->wait_frame(clock.now()).error().message, "camera cam-0: no frame arrived in time");
+}
+
+/// The pulse reached the camera, but nobody noted its instant.
+TEST_F(AravisSuite, ATriggerWhoseInstantIsUnknownIsNotAnswered) {
+  add_camera();
+  const auto camera = open();
+  ASSERT_TRUE(camera);
+  ASSERT_TRUE(arm(*camera, 3));
+  camera->note_trigger(0, pulse());
+  EXPECT_EQ(camera->wait_frame(soon())->index, 0);
+  std::this_thread::sleep_for(std::chrono::milliseconds(400));  // farther from a trigger than any answer may be
+  pulse();
+  EXPECT_EQ(camera->wait_frame(clock.now() + milliseconds(900)).error().code, ErrorCode::timeout);
+  camera->note_trigger(1, pulse());
+  const auto frame = camera->wait_frame(soon());
+  ASSERT_TRUE(frame) << frame.error().message;
+  EXPECT_EQ(frame->index, 1);
+  EXPECT_EQ(statistic(*camera, "unwanted_frames"), 1);
+}
+
 TEST_F(AravisSuite, WarnsWhenTheKernelCutsTheSocketBuffer) {
   add_camera();
   settings.cameras[0].socket_buffer_kib = 1 << 20;

@@ -3,10 +3,13 @@
 #include <linux/videodev2.h>
 
 #include <atomic>
+#include <cerrno>
 #include <memory>
 #include <thread>
+#include <tuple>
 
 #include "drivers/v4l2/v4l2_source.h"
+#include "drivers/v4l2/video_error.h"
 #include "pipeline/image/codec.h"
 #include "tests/drivers/camera_conformance.h"
 #include "tests/drivers/noting_source.h"
@@ -362,6 +365,76 @@ TEST_F(V4l2, TranslatesWhyAStreamDoesNotBegin) {
   const auto refused = (*open(settings()))->arm({}, 1);
   EXPECT_EQ(refused.error().code, ErrorCode::unsupported);
   EXPECT_THAT(refused.error().message, HasSubstr("monotonic clock"));
+}
+
+TEST_F(V4l2, SaysWhatTheSystemsRefusalsMean) {
+  const std::tuple<int, ErrorCode, const char*> cases[] = {
+      {ENODEV, ErrorCode::device_lost, "it is not plugged in"},
+      {ENXIO, ErrorCode::device_lost, "it is not plugged in"},
+      {ENOENT, ErrorCode::device_lost, "it is not plugged in"},
+      {EBUSY, ErrorCode::busy, "another program uses it"},
+      {EACCES, ErrorCode::io, "not permitted; is this user in the group video?"},
+      {EPERM, ErrorCode::io, "not permitted; is this user in the group video?"},
+      {EIO, ErrorCode::device_lost, "it does not answer (Input/output error)"},
+      {EPIPE, ErrorCode::device_lost, "it does not answer (Broken pipe)"},
+      {EPROTO, ErrorCode::device_lost, "it does not answer (Protocol error)"},
+      {ETIMEDOUT, ErrorCode::device_lost, "it does not answer (Connection timed out)"},
+      {EINVAL, ErrorCode::io, "Invalid argument"}};
+  for (const auto& [error, code, meaning] : cases) {
+    const Error said = system_error("body-00", "/dev/video0 cannot be opened", error);
+    EXPECT_EQ(said.code, code);
+    EXPECT_EQ(said.message, std::string("body-00: /dev/video0 cannot be opened: ") + meaning);
+  }
+  auto refused = settings();
+  refused.device = "/dev/video7";
+  EXPECT_EQ(refusal(refused, ErrorCode::device_lost), "body-00: no camera is plugged in as /dev/video7");
+}
+
+TEST_F(V4l2, ACameraThatOffersNothingUsefulIsRefused) {
+  auto exotic = usual_camera();
+  exotic.sizes = {{V4L2_PIX_FMT_H264, 16, 8}};
+  system->plug_in(exotic);
+  auto any = settings();
+  any.format = V4l2Format::automatic;
+  any.width = any.height = 0;
+  EXPECT_EQ(refusal(any, ErrorCode::unsupported),
+            "body-00: the camera offers none of the formats mjpg, yuyv, grey and 8-bit Bayer");
+  exotic.sizes = {{V4L2_PIX_FMT_YUYV, 15, 8}};
+  system->plug_in(exotic);
+  EXPECT_EQ(refusal(any, ErrorCode::unsupported), "body-00: yuyv pictures of an odd width cannot be read");
+}
+
+TEST_F(V4l2, ACameraIsOpenedOnceAndOnlyWhereItIsConfigured) {
+  const auto cameras = source({settings()});
+  const auto camera = cameras->open_camera(id);
+  ASSERT_TRUE(camera);
+  EXPECT_EQ(cameras->open_camera(id).error().message, "body-00: is open already");
+  EXPECT_EQ(cameras->open_camera("other").error().message,
+            "other: no camera of that name is configured for the driver v4l2");
+  EXPECT_EQ(cameras->open_trigger().error().message, "v4l2: USB cameras have no trigger");
+}
+
+/// Nobody noted the instant of the second one: its frame answers nothing, and the third one's is not taken for it.
+TEST_F(V4l2, ATriggerWhoseInstantIsUnknownIsNotAnswered) {
+  auto near = settings();
+  near.max_offset_ms = 20;
+  const auto camera = armed(near);
+  const auto fire = [&](std::optional<int> index) {
+    const Timestamp when = clock.now();
+    if (index) camera->note_trigger(*index, when);
+    EXPECT_TRUE(system->send(node, jpeg(), when + milliseconds(1)));
+    std::this_thread::sleep_for(std::chrono::milliseconds(60));
+  };
+  fire(0);
+  const auto first = camera->wait_frame(soon());
+  ASSERT_TRUE(first) << first.error().message;
+  EXPECT_EQ(first->index, 0);
+  fire({});
+  EXPECT_EQ(camera->wait_frame(clock.now() + milliseconds(100)).error().code, ErrorCode::timeout);
+  fire(2);
+  const auto third = camera->wait_frame(soon());
+  ASSERT_TRUE(third) << third.error().message;
+  EXPECT_EQ(third->index, 2);
 }
 
 TEST_F(V4l2, ABrokenStreamLosesTheCamera) {

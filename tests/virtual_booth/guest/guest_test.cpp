@@ -6,6 +6,7 @@
 #include <sys/ioctl.h>
 #include <sys/wait.h>
 #include <unistd.h>
+#include <xf86drm.h>
 
 #include <csignal>
 #include <cstdlib>
@@ -139,6 +140,15 @@ class OtherProcess {
  private:
   pid_t process_ = 0;
   int said_ = -1;
+};
+
+/// Nobody in particular, while it lives: who may use no device.
+class Nobody {
+ public:
+  Nobody() { EXPECT_EQ(::seteuid(65534), 0); }
+  ~Nobody() { EXPECT_EQ(::seteuid(0), 0); }
+  Nobody(const Nobody&) = delete;
+  Nobody& operator=(const Nobody&) = delete;
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -408,6 +418,20 @@ TEST_F(UsbSettings, ACameraInUseBySomebodyElseSaysSo) {
   EXPECT_THAT(refused.error().message, HasSubstr("another program uses it"));
 }
 
+TEST_F(UsbSettings, ACameraThatThisUserMayNotUseSaysSo) {
+  const auto source = open_source({wired("set", 64, 48)});
+  const std::string node = source->discover()->front().address;
+  auto by_node = wired("set", 64, 48);
+  by_node.serial.clear();
+  by_node.device = node;
+  const Nobody nobody;
+  const auto refused = open_source({by_node})->open_camera("set");
+  ASSERT_FALSE(refused);
+  EXPECT_EQ(refused.error().code, ErrorCode::io);
+  EXPECT_EQ(refused.error().message,
+            "set: " + node + " cannot be opened: not permitted; is this user in the group video?");
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Faults that the kernel's test driver vivid injects
 
@@ -570,6 +594,22 @@ TEST_F(GpioLines, AreFoundByTheirNamesAndRefusedWithTheReason) {
             "gpio trigger: line 99 of " + chip + " does not exist: the chip has lines 0 … 7");
   by_name.trigger.line = "nowhere";
   EXPECT_EQ(open_gpio_trigger(by_name, clock).error().code, ErrorCode::not_found);
+  EXPECT_EQ(open_gpio_trigger(by_name, clock).error().message,
+            "gpio trigger: line nowhere of " + chip + " does not exist: no line of the chip has that name");
+  auto lit = trigger_settings();
+  lit.trigger = line(4);
+  lit.lights = line(0);
+  EXPECT_EQ(open_gpio_trigger(lit, clock).error().message,
+            "gpio lights: line 0 of " + chip + " is in use by boothd trigger");
+  EXPECT_EQ(open_gpio_projector({.step = line(0), .reset = line(3)}, clock).error().message,
+            "projector: line 0 of " + chip + " is in use by boothd trigger");
+  const Nobody nobody;
+  const auto forbidden = open_gpio_trigger({.trigger = line(5)}, clock);
+  ASSERT_FALSE(forbidden);
+  EXPECT_EQ(forbidden.error().code, ErrorCode::io);
+  EXPECT_EQ(forbidden.error().message, "gpio trigger: line 5 of " + chip +
+                                           " cannot be had, as the chip cannot be opened: Permission denied; is this "
+                                           "user in the group gpio?");
 }
 
 TEST_F(GpioLines, AProjectorIsSteppedAndReset) {
@@ -725,6 +765,46 @@ TEST_F(Display, BadSettingsAreRefusedWithWhatIsOffered) {
   bad = settings();
   bad.card = "/dev/dri/card7";
   EXPECT_EQ(open_display_projector(bad, clock).error().code, ErrorCode::device_lost);
+  EXPECT_EQ(open_display_projector(bad, clock).error().message,
+            "projector: /dev/dri/card7 cannot be opened: No such file or directory");
+}
+
+TEST_F(Display, ACardThatThisUserMayNotUseSaysSo) {
+  const Nobody nobody;
+  const auto refused = open_display_projector(settings(), clock);
+  ASSERT_FALSE(refused);
+  EXPECT_EQ(refused.error().code, ErrorCode::io);
+  EXPECT_EQ(refused.error().message,
+            "projector: /dev/dri/card0 cannot be opened: Permission denied; is this user in the group video?");
+}
+
+TEST_F(Display, AnUnpluggedDisplaySaysSo) {
+  const std::string status = "/sys/class/drm/card0-Virtual-1/status";
+  std::ofstream(status) << "off" << std::flush;
+  EXPECT_EQ(open_display_projector(settings(), clock).error().message,
+            "projector: no display is connected to /dev/dri/card0");
+  auto named = settings();
+  named.connector = "Virtual-1";
+  const auto refused = open_display_projector(named, clock);
+  EXPECT_EQ(refused.error().code, ErrorCode::device_lost);
+  EXPECT_EQ(refused.error().message, "projector: nothing is connected to Virtual-1 of /dev/dri/card0");
+  std::ofstream(status) << "on" << std::flush;
+  EXPECT_TRUE(open(named));
+}
+
+/// A window system that starts takes the display away from whoever draws on it.
+TEST_F(Display, AnotherProgramThatTakesTheDisplayOverIsSuspected) {
+  const auto projector = open(settings());
+  ASSERT_TRUE(projector && projector->show(40));
+  for (const auto& entry : std::filesystem::directory_iterator("/proc/self/fd")) {
+    std::error_code gone;
+    if (std::filesystem::read_symlink(entry.path(), gone) == GuestBooth::card)
+      drmDropMaster(std::stoi(entry.path().filename()));
+  }
+  const auto shown = projector->show(0);
+  ASSERT_FALSE(shown);
+  EXPECT_EQ(shown.error().code, ErrorCode::device_lost);
+  EXPECT_EQ(shown.error().message, "projector: it does not flip: another program took /dev/dri/card0 over");
 }
 
 /// The whole face sequence: projector, trigger, camera. The camera sees what the display shows at its exposure.
