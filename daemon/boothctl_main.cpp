@@ -21,6 +21,7 @@
 #include "daemon/api/client.h"
 #include "daemon/api/requests.h"
 #include "daemon/boothctl/command.h"
+#include "daemon/boothctl/correct.h"
 #include "daemon/boothctl/doctor.h"
 #include "daemon/boothctl/keys.h"
 #include "daemon/identifier.h"
@@ -576,8 +577,10 @@ int main(int argc, char** argv) {
   board->callback([&] { offline = [&] { booth::write_board(board_options); }; });
   booth::OfflineCalibrationOptions calibration;
   auto* calibrate = app.add_subcommand("calibrate", "solve the rig from recordings of a board");
-  calibrate->add_option("--recording", calibration.recordings, "a recording with a board shot; may be repeated")
-      ->required();
+  auto* boards =
+      calibrate->add_option("--recording", calibration.recordings, "a recording with a board shot; may be repeated");
+  const booth::CorrectCommand correct(*calibrate);
+  correct.option()->excludes(boards);
   calibrate->add_option("--out", calibration.out, "the folder to make: rig.json, report.html, calibration.json")
       ->required();
   calibrate->add_option("--floor", calibration.floor_index,
@@ -585,7 +588,14 @@ int main(int argc, char** argv) {
                         "where the recording's lies");
   calibrate->add_flag("--keep-unseen", calibration.keep_unseen,
                       "cameras that never saw the board keep the recording's calibration");
-  calibrate->callback([&] { offline = [&] { booth::calibrate_offline(calibration); }; });
+  calibrate->callback([&] {
+    if (!correct.wanted() && calibration.recordings.empty()) throw CLI::RequiredError("--recording or --correct");
+    offline = [&] {
+      if (!correct.wanted()) return booth::calibrate_offline(calibration);
+      if (const auto done = correct.run(calibration.out); !done)
+        throw booth::Failure{booth::exit_refused, done.error().message};
+    };
+  });
   booth::add_doctor_command(app, options.json, offline);
   booth::add_keys_command(app, options.json, offline);
   auto* projector = app.add_subcommand("projector", "what lights the face with patterns");

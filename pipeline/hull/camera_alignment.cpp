@@ -180,22 +180,16 @@ struct Trial {
 };
 
 /// @param free  cameras that were found to have moved
-Look look_at(const SilhouetteViews& views, const Field& hull, const std::vector<bool>& free, const Work& work) {
-  const std::vector<CoherenceSample> samples = sample_coherence(views, hull, work);
+Look look_at(const AlignmentScenes& scenes, const std::vector<bool>& free, const Work& work) {
+  const std::vector<CoherenceSample> samples = scenes.sample(work);
   if (work.stopped() || samples.empty()) return {};
-  std::vector<size_t> counts(views.size());
+  std::vector<size_t> counts(scenes.cameras());
   for (const CoherenceSample& sample : samples) ++counts[sample.slopes[0].view];
-  std::vector<bool> judged(views.size());
-  std::vector<const CalibratedView*> cameras;
-  for (size_t v = 0; v < views.size(); ++v) {
-    judged[v] = counts[v] >= fewest_samples;
-    cameras.push_back(&views[v]->camera());
-  }
-  const Grid& grid = hull.grid();
-  const Eigen::Vector3d center = (grid.origin + grid.point(grid.size[0] - 1, grid.size[1] - 1, grid.size[2] - 1)) / 2;
-  const PoseEstimation estimation(samples, pose_scales(cameras, center, samples));
+  std::vector<bool> judged(scenes.cameras());
+  for (size_t v = 0; v < judged.size(); ++v) judged[v] = counts[v] >= fewest_samples;
+  const PoseEstimation estimation(samples, scenes.scales(samples));
   Look look;
-  look.misses.resize(views.size());
+  look.misses.resize(scenes.cameras());
   for (const CoherenceSample& sample : samples)
     for (const CoherenceSample::Slope& slope : sample.slopes)
       if (!slope.px.isZero())
@@ -213,24 +207,64 @@ Look look_at(const SilhouetteViews& views, const Field& hull, const std::vector<
 
 }  // namespace
 
-std::vector<CameraDeviation> realign_cameras(Rig& rig, SilhouetteViews& views, const Field& hull, const Work& work) {
-  std::vector<CameraDeviation> found(views.size());
-  if (views.size() < fewest_judges) return found;
-  std::vector<bool> free(views.size());
+AlignmentScenes::AlignmentScenes(Rig& rig, std::span<const AlignmentScene> scenes) {
+  for (const AlignmentScene& scene : scenes) {
+    if (scene.views->size() < fewest_judges) continue;
+    scenes_.push_back(scene);
+    for (const auto& view : *scene.views) {
+      const auto known = std::find_if(cameras_.begin(), cameras_.end(),
+                                      [&](const RigCamera* camera) { return camera->id == view->camera().id; });
+      cameras_of_views_.emplace_back(static_cast<size_t>(known - cameras_.begin()));
+      if (known != cameras_.end()) continue;
+      cameras_.push_back(&*std::find_if(rig.cameras.begin(), rig.cameras.end(),
+                                        [&](const RigCamera& camera) { return camera.id == view->camera().id; }));
+    }
+  }
+}
+
+void AlignmentScenes::put(size_t camera, const Eigen::Isometry3d& camera_from_world) {
+  cameras_[camera]->camera_from_world = camera_from_world;
+  size_t n = 0;
+  for (const AlignmentScene& scene : scenes_)
+    for (auto& view : *scene.views)
+      if (cameras_of_views_[n++] == camera)
+        view = std::make_unique<SilhouetteView>(*cameras_[camera], view->coverage());
+}
+
+std::vector<CoherenceSample> AlignmentScenes::sample(const Work& work) const {
+  std::vector<CoherenceSample> all;
+  size_t first = 0;
+  for (const AlignmentScene& scene : scenes_) {
+    for (CoherenceSample sample : sample_coherence(*scene.views, *scene.hull, work)) {
+      for (CoherenceSample::Slope& slope : sample.slopes) slope.view = cameras_of_views_[first + slope.view];
+      all.push_back(sample);
+    }
+    first += scene.views->size();
+  }
+  return all;
+}
+
+std::vector<PoseScale> AlignmentScenes::scales(std::span<const CoherenceSample> samples) const {
+  Eigen::Vector3d center = Eigen::Vector3d::Zero();
+  for (const AlignmentScene& scene : scenes_) {
+    const Grid& grid = scene.hull->grid();
+    center += (grid.origin + grid.point(grid.size[0] - 1, grid.size[1] - 1, grid.size[2] - 1)) / 2;
+  }
+  center /= static_cast<double>(scenes_.size());
+  return pose_scales(std::vector<const CalibratedView*>(cameras_.begin(), cameras_.end()), center, samples);
+}
+
+std::vector<CameraDeviation> realign_cameras(AlignmentScenes& scenes, const Work& work) {
+  std::vector<CameraDeviation> found(scenes.cameras());
+  std::vector<bool> free(scenes.cameras());
   const auto note = [&](const Look& look) {
     for (const Look::Camera& camera : look.cameras)
       found[camera.view] = {.offset_px = camera.offset_px, .deviation = camera.deviation};
   };
-  const auto put = [&](size_t v, const Eigen::Isometry3d& camera_from_world) {
-    std::find_if(rig.cameras.begin(), rig.cameras.end(), [&](const RigCamera& camera) {
-      return camera.id == views[v]->camera().id;
-    })->camera_from_world = camera_from_world;
-    views[v] = std::make_unique<SilhouetteView>(views[v]->camera(), views[v]->coverage());
-  };
-  Look look = look_at(views, hull, free, work);
+  Look look = look_at(scenes, free, work);
   note(look);
   double least = suspicious;
-  for (size_t moved = 0; moved < views.size() / 3; ++moved) {
+  for (size_t moved = 0; moved < scenes.cameras() / 3; ++moved) {
     if (look.cameras.empty() || look.cameras.front().deviation <= least) break;
     // Cameras that face each other see the same outline, so that either may seem to have moved: each of those that are
     // about as suspicious is put back where it would belong, and the one without which the others agree best it was.
@@ -240,12 +274,12 @@ std::vector<CameraDeviation> realign_cameras(Rig& rig, SilhouetteViews& views, c
     if (suspects.size() > most_suspects) suspects.resize(most_suspects);
     std::optional<Trial> best;
     for (const Look::Camera& suspect : suspects) {
-      const Eigen::Isometry3d as_calibrated = views[suspect.view]->camera().camera_from_world;
+      const Eigen::Isometry3d as_calibrated = scenes.camera(suspect.view).camera_from_world;
       // From where it belongs, all others are measured anew: what it stirred up in them is not theirs.
-      put(suspect.view, changed_pose(as_calibrated, suspect.change));
+      scenes.put(suspect.view, changed_pose(as_calibrated, suspect.change));
       free[suspect.view] = true;
-      Trial trial{suspect, look_at(views, hull, free, work)};
-      put(suspect.view, as_calibrated);
+      Trial trial{suspect, look_at(scenes, free, work)};
+      scenes.put(suspect.view, as_calibrated);
       free[suspect.view] = false;
       if (trial.look.cameras.empty()) return found;
       if (!best || trial.look.all_misses() < best->look.all_misses()) best = std::move(trial);
@@ -254,16 +288,23 @@ std::vector<CameraDeviation> realign_cameras(Rig& rig, SilhouetteViews& views, c
     if (suspect.deviation <= least * best->look.unrest() ||
         best->look.misses[suspect.view] > settled_share * look.misses[suspect.view])
       break;
-    put(suspect.view, changed_pose(views[suspect.view]->camera().camera_from_world, suspect.change));
+    scenes.put(suspect.view, changed_pose(scenes.camera(suspect.view).camera_from_world, suspect.change));
     free[suspect.view] = true;
     found[suspect.view] = {.offset_px = suspect.offset_px, .deviation = suspect.deviation, .moved = true};
     look = std::move(best->look);
-    for (size_t v = 0; v < views.size(); ++v)
-      if (free[v]) put(v, changed_pose(views[v]->camera().camera_from_world, look.left[v]));
+    for (size_t v = 0; v < free.size(); ++v)
+      if (free[v]) scenes.put(v, changed_pose(scenes.camera(v).camera_from_world, look.left[v]));
     note(look);
     least = suspicious * next_suspicious;
   }
   return found;
+}
+
+std::vector<CameraDeviation> realign_cameras(Rig& rig, SilhouetteViews& views, const Field& hull, const Work& work) {
+  const AlignmentScene scene{&views, &hull};
+  AlignmentScenes scenes(rig, std::span(&scene, 1));
+  if (scenes.cameras() == 0) return std::vector<CameraDeviation>(views.size());
+  return realign_cameras(scenes, work);
 }
 
 }  // namespace booth

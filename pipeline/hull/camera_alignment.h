@@ -1,8 +1,10 @@
 #pragma once
 
+#include <span>
 #include <vector>
 
 #include "pipeline/geometry/silhouette_view.h"
+#include "pipeline/hull/pose_estimation.h"
 #include "pipeline/types/field.h"
 #include "pipeline/types/rig.h"
 #include "pipeline/types/work.h"
@@ -30,5 +32,34 @@ struct CameraDeviation {
 /// on Signal Processing 41(12), 1993.
 std::vector<CameraDeviation> realign_cameras(Rig& rig, SilhouetteViews& views, const Field& hull,
                                              const Work& work = {});
+
+/// What one capture shows.
+struct AlignmentScene {
+  SilhouetteViews* views = nullptr;
+  const Field* hull = nullptr;  ///< carved from the views; it tells where to look
+};
+
+/// Several captures by the same cameras; together they say more about each.
+class AlignmentScenes {
+ public:
+  /// @param rig  holds the cameras of all views, and is changed with them; scenes of fewer than six views are left out
+  AlignmentScenes(Rig& rig, std::span<const AlignmentScene> scenes);
+
+  /// Those that are in a scene are counted in the order in which they appear.
+  size_t cameras() const { return cameras_.size(); }
+  const RigCamera& camera(size_t camera) const { return *cameras_[camera]; }
+  void put(size_t camera, const Eigen::Isometry3d& camera_from_world);
+  /// Of all scenes; their views are cameras.
+  std::vector<CoherenceSample> sample(const Work& work) const;
+  std::vector<PoseScale> scales(std::span<const CoherenceSample> samples) const;
+
+ private:
+  std::vector<AlignmentScene> scenes_;
+  std::vector<RigCamera*> cameras_;
+  std::vector<size_t> cameras_of_views_;  ///< one scene after the other
+};
+
+/// The same from several captures. @return by camera of the scenes
+std::vector<CameraDeviation> realign_cameras(AlignmentScenes& scenes, const Work& work = {});
 
 }  // namespace booth
