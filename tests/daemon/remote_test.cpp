@@ -124,6 +124,17 @@ TEST(Roles, EachMayAllThatThoseBeforeItMay) {
   EXPECT_FALSE(api::may(Role::kiosk, api::Method::system_shutdown));
 }
 
+TEST(Roles, AreThoseOfTheSchemas) {
+  std::ifstream file(fs::path(BOOTH_SOURCE_DIR) / "daemon/api/schema/booth-api-1.json");
+  const Json schemas = Json::parse(file)["methods"];
+  for (const api::MethodEntry& entry : api::methods) {
+    const std::string name(entry.name);
+    ASSERT_TRUE(schemas.contains(name)) << name;
+    EXPECT_EQ(schemas[name]["role"], api::to_string(api::least_role(entry.method))) << name;
+    EXPECT_EQ(schemas[name]["params"]["properties"].contains("key"), entry.changes) << name;
+  }
+}
+
 TEST(Zap, LetsInKnownKeysOnly) {
   const ScratchFolder folder;
   const CurveKeyPair known = new_keys(), stranger = new_keys();

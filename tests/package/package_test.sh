@@ -32,6 +32,8 @@ for file in usr/bin/boothd usr/bin/boothctl usr/bin/booth-reconstruct usr/lib/sy
   usr/lib/sysctl.d/70-booth.conf etc/booth/boothd.toml usr/share/man/man1/boothctl.1.gz usr/share/man/man1/boothd.1.gz \
   usr/share/man/man1/booth-reconstruct.1.gz usr/share/man/man5/boothd.toml.5.gz \
   usr/share/bash-completion/completions/boothctl usr/share/avatar-booth/recordings/mini/recording.json \
+  usr/share/avatar-booth/schema/booth-api-1.json \
+  usr/lib/python3/dist-packages/avatar_booth.py usr/share/avatar-booth/conformance.py \
   usr/share/doc/avatar-booth/copyright; do
   grep -q " root/root .* \./$file$" "$scratch/contents" || fail "$file is not in the package, or not root's"
 done
