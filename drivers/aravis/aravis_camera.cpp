@@ -163,6 +163,8 @@ Result<void> AravisCamera::make_stream() {
                                                          ? ARV_GV_PACKET_SIZE_ADJUSTMENT_ALWAYS
                                                          : ARV_GV_PACKET_SIZE_ADJUSTMENT_ON_FAILURE);
   }
+  // The other mode announces no frames.
+  if (!gige) arv_uv_device_set_usb_mode(ARV_UV_DEVICE(arv_camera_get_device(camera)), ARV_UV_USB_MODE_SYNC);
   stream_.reset(arv_camera_create_stream_full(
       camera,
       [](gpointer data, ArvStreamCallbackType type, ArvBuffer*) {

@@ -112,7 +112,9 @@ class V4l2Registry {
     if (!settings.device.empty()) {
       const std::string path = system_->resolve(settings.device);
       if (path.empty()) return absent;
-      return identify(*system_, path);
+      auto node = identify(*system_, path);
+      if (!node) return Error{node.error().code, settings.id + ": " + node.error().message};
+      return node;
     }
     std::optional<VideoNode> found;
     for (VideoNode& node : capture_nodes()) {

@@ -153,8 +153,8 @@ TEST_P(CameraConformance, ArmingAnewDropsOldFrames) {
   ASSERT_TRUE(camera && trigger);
   ASSERT_TRUE(arm(*camera, 2));
   ASSERT_TRUE(trigger->fire());
-  ASSERT_TRUE(trigger->fire());
   EXPECT_TRUE(camera->wait_frame(soon()));
+  ASSERT_TRUE(trigger->fire());
   ASSERT_TRUE(arm(*camera, 1));
   EXPECT_EQ(camera->wait_frame(clock.now() + not_long).error().code, ErrorCode::timeout);
   ASSERT_TRUE(trigger->fire());

@@ -7,6 +7,8 @@
 namespace booth {
 
 GuestBooth::GuestBooth() {
+  // libusb hears from it of devices that are plugged in later.
+  if (std::system("/lib/systemd/systemd-udevd --daemon") != 0) throw std::runtime_error("udevd does not run");
   for (const char* module : {"gpio-sim", "vhci-hcd", "uvcvideo", "vkms"})
     if (std::system((std::string("modprobe ") + module).c_str()) != 0)
       throw std::runtime_error(std::string("the kernel has no module ") + module);

@@ -429,7 +429,7 @@ TEST_F(UsbSettings, ACameraThatThisUserMayNotUseSaysSo) {
   ASSERT_FALSE(refused);
   EXPECT_EQ(refused.error().code, ErrorCode::io);
   EXPECT_EQ(refused.error().message,
-            "set: " + node + " cannot be opened: not permitted; is this user in the group video?");
+            "set: " + node + ": cannot be opened: not permitted; is this user in the group video?");
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
