@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Geometry>
+#include <limits>
 #include <vector>
 
 #include "pipeline/types/result.h"
@@ -35,6 +36,12 @@ struct BundlePriors {
   double principal_point = 0.5;          ///< of the image's width and height
   double k1 = 0.3, k2 = 0.2, k3 = 0.05;  ///< lenses of booths stay well within
   double tangential = 0.0015;            ///< p1, p2
+
+  /// Nothing is believed.
+  static BundlePriors none() {
+    constexpr double anything = std::numeric_limits<double>::infinity();
+    return {anything, anything, anything, anything, anything};
+  }
 };
 
 struct BundleOptions {

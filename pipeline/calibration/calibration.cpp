@@ -299,6 +299,17 @@ Result<double> adjust_robustly(Bundle& bundle, bool weigh, const Work& work) {
   return spread(bundle);
 }
 
+/// Plain least squares over all corners. @return the residuals' spread
+Result<double> adjust_plainly(Bundle& bundle, const Work& work) {
+  for (BundleObservation& observation : bundle.observations) {
+    observation.outlier = false;
+    observation.covariance = Eigen::Matrix2d::Identity();
+  }
+  const BundleOptions options{.priors = BundlePriors::none(), .loss_scale = 0};
+  if (const auto adjusted = adjust(bundle, options, work); !adjusted) return adjusted.error();
+  return spread(bundle);
+}
+
 /// Replaces the corners of every view that has a crop by those that the whole pattern gives.
 /// @return how far corners moved, root mean square, pixels
 double refine_corners(const Task& task, Connected& connected, std::map<std::pair<int, int>, double>& blur,
@@ -608,9 +619,15 @@ Result<Calibration> solve_calibration(const CalibrationInput& input, const Calib
     }
   }
 
+  if (options.plain_least_squares) {
+    scale = adjust_plainly(bundle, work);
+    if (!scale) return scale.error();
+  }
+
   const Placement placement = place(task, connected, rig_of(task, connected));
   move_world(bundle, placement.world_from_bundle);
-  const auto covariances = device_covariances(bundle, {}, *scale * *scale);
+  const auto covariances =
+      device_covariances(bundle, options.plain_least_squares ? BundlePriors::none() : BundlePriors{}, *scale * *scale);
 
   Calibration solved;
   solved.rig = rig_of(task, connected);

@@ -36,11 +36,14 @@ struct CalibrationInput {
 };
 
 struct CalibrationOptions {
-  bool refine_corners = true;    ///< register the whole printed pattern around each corner instead of its saddle alone
-  int fewest_poses = 3;          ///< fewer distinct poses of the board are refused, 2 … 1000
-  double good_rms_px = 0.25;     ///< worst camera's, up to which a calibration is good
-  double usable_rms_px = 0.6;    ///< up to which it is usable
-  double good_center_m = 0.001;  ///< worst uncertainty of a camera's centre, up to which a calibration is good
+  bool refine_corners = true;  ///< register the whole printed pattern around each corner instead of its saddle alone
+  /// Ends with least squares over all corners, outliers too, each counting alike, without any belief about lenses: to
+  /// compare with other programs, and where the views are many. Otherwise weak priors decide what few views leave open.
+  bool plain_least_squares = false;
+  int fewest_poses = 3;            ///< fewer distinct poses of the board are refused, 2 … 1000
+  double good_rms_px = 0.25;       ///< worst camera's, up to which a calibration is good
+  double usable_rms_px = 0.6;      ///< up to which it is usable
+  double good_center_m = 0.001;    ///< worst uncertainty of a camera's centre, up to which a calibration is good
   double usable_center_m = 0.004;  ///< up to which it is usable
 };
 
