@@ -352,10 +352,11 @@ Result<BoardView> find_board(const std::string& camera, int pose, const Image& i
 
 Result<BoardView> projector_view(const BoardView& camera, const FloatImage& position, const FloatImage& sigma,
                                  const std::string& projector) {
-  if (position.channels != 2 || sigma.channels != 2 || position.width != sigma.width ||
+  if (position.channels != 2 || sigma.channels != 1 || position.width != sigma.width ||
       position.height != sigma.height || position.empty())
-    return Error{ErrorCode::invalid_argument,
-                 camera.camera + ": projector positions and their deviations need two channels and the same size"};
+    return Error{
+        ErrorCode::invalid_argument,
+        camera.camera + ": projector positions need two channels, their deviations one, and both the same size"};
   // Around a corner the projector's coordinates are a smooth function of the camera's; a plane is enough for a window
   // of a few pixels, and weighs down single wrong ones.
   constexpr int half = 4;
@@ -370,17 +371,16 @@ Result<BoardView> projector_view(const BoardView& camera, const FloatImage& posi
     struct Sample {
       Eigen::Vector3d basis;
       Eigen::Vector2d value;
-      Eigen::Vector2d weight;
+      double weight;
     };
     std::vector<Sample> samples;
     for (int y = cy - half; y <= cy + half; ++y)
       for (int x = cx - half; x <= cx + half; ++x) {
         if (!position.contains(x, y)) continue;
         const Eigen::Vector2d value(position.at(x, y, 0), position.at(x, y, 1));
-        const Eigen::Vector2d deviation(sigma.at(x, y, 0), sigma.at(x, y, 1));
-        if (!value.allFinite() || !(deviation.minCoeff() > 0) || !deviation.allFinite()) continue;
-        samples.push_back(
-            {{1.0, x - corner.pixel.x(), y - corner.pixel.y()}, value, deviation.cwiseAbs2().cwiseInverse()});
+        const double deviation = sigma.at(x, y);
+        if (!value.allFinite() || !(deviation > 0) || !std::isfinite(deviation)) continue;
+        samples.push_back({{1.0, x - corner.pixel.x(), y - corner.pixel.y()}, value, 1 / (deviation * deviation)});
       }
     Eigen::Vector2d centre;
     Eigen::Matrix2d covariance = Eigen::Matrix2d::Zero();
@@ -397,8 +397,8 @@ Result<BoardView> projector_view(const BoardView& camera, const FloatImage& posi
         used = 0;
         for (const Sample& s : samples) {
           if (pass > 0 && std::abs(s.basis.dot(fit) - s.value[axis]) > most_residual_px) continue;
-          normal += s.weight[axis] * s.basis * s.basis.transpose();
-          right += s.weight[axis] * s.value[axis] * s.basis;
+          normal += s.weight * s.basis * s.basis.transpose();
+          right += s.weight * s.value[axis] * s.basis;
           ++used;
         }
         fits = used >= fewest_pixels && normal.determinant() > 0;
@@ -409,7 +409,7 @@ Result<BoardView> projector_view(const BoardView& camera, const FloatImage& posi
       if (!fits) break;
       for (const Sample& s : samples) {
         const double off = s.basis.dot(fit) - s.value[axis];
-        if (std::abs(off) <= most_residual_px) residual += s.weight[axis] * off * off;
+        if (std::abs(off) <= most_residual_px) residual += s.weight * off * off;
       }
       centre[axis] = fit[0];
       gradient.row(axis) = fit.tail<2>().transpose();

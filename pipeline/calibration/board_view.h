@@ -55,11 +55,11 @@ Result<BoardView> find_board(const std::string& camera, int pose, const Image& i
 ///
 /// @param camera     the corners in a camera's picture, the board at rest since
 /// @param position   2 channels: the projector's column and row that light each pixel of that camera, NaN where unknown
-/// @param sigma      2 channels: their standard deviations, projector pixels
+/// @param sigma      1 channel: the standard deviation of each of the two, projector pixels
 /// @param projector  its id
 /// @return the view of the projector as an inverse camera: corners in projector pixels; those around which too little
 ///         was decoded are left out
-/// @error invalid_argument  position and sigma are not of the same size with 2 channels each
+/// @error invalid_argument  position and sigma are not of the same size, or have other channels
 Result<BoardView> projector_view(const BoardView& camera, const FloatImage& position, const FloatImage& sigma,
                                  const std::string& projector);
 

@@ -562,7 +562,7 @@ TEST(ProjectorView, IsWhatWasDecodedAroundEachCorner) {
     camera.corners.push_back({.id = id,
                               .pixel = std::array{good, dark, edge}[static_cast<size_t>(id)],
                               .covariance = 1e-4 * Eigen::Matrix2d::Identity()});
-  FloatImage position(100, 50, 2), sigma(100, 50, 2, 0.1F);
+  FloatImage position(100, 50, 2), sigma(100, 50, 1, 0.1F);
   std::mt19937 random(1);
   std::normal_distribution<double> noise(0, 0.1);
   for (int y = 0; y < 50; ++y)
@@ -582,7 +582,7 @@ TEST(ProjectorView, IsWhatWasDecodedAroundEachCorner) {
   EXPECT_LT((view->corners[0].pixel - expected).norm(), 0.1);
   EXPECT_LT(view->corners[0].covariance.trace(), 0.01);
   for (const TargetCorner& corner : view->corners) EXPECT_NE(corner.id, 1) << "nothing was decoded there";
-  EXPECT_FALSE(projector_view(camera, position, FloatImage(100, 50, 1), "projector"));
+  EXPECT_FALSE(projector_view(camera, position, FloatImage(100, 50, 2), "projector"));
 }
 
 TEST(Coverage, WantsTheNeediestCameraFirstAndIsContentInTheEnd) {

@@ -20,7 +20,8 @@ Eigen::Isometry3d look_at(const Eigen::Vector3d& eye, const Eigen::Vector3d& tar
   return camera_from_world;
 }
 
-/// How bright the pattern of an image is at a projector coordinate, 0 … 1, blurred.
+}  // namespace
+
 double brightness(const GrayCodePattern& pattern, int image, const Eigen::Vector2d& at, double blur_px) {
   const int images = pattern_count(pattern);
   if (image == images - 2) return 1;
@@ -41,8 +42,6 @@ double brightness(const GrayCodePattern& pattern, int image, const Eigen::Vector
   }
   return image % 2 == 0 ? sum : 1 - sum;
 }
-
-}  // namespace
 
 Rig scanner_rig(const Eigen::Vector3d& target) {
   Rig rig = ring_rig({.cameras = 3});

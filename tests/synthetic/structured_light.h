@@ -13,6 +13,10 @@ namespace booth::synthetic {
 /// as ring_rig's.
 Rig scanner_rig(const Eigen::Vector3d& target);
 
+/// How bright an image of the pattern is at a projector coordinate, 0 … 1: each projector pixel is a box, blurred by a
+/// Gaussian of that standard deviation in projector pixels.
+double brightness(const GrayCodePattern& pattern, int image, const Eigen::Vector2d& at, double blur_px);
+
 struct GrayCodeScene {
   double ambient = 30;    ///< grey levels without the projector
   double contrast = 120;  ///< grey levels that the projector adds where it shines straight on
