@@ -70,6 +70,19 @@ void visit_background(Visitor& visitor, BackgroundConfig& background) {
 }
 
 template <class Visitor>
+void visit_calibration(Visitor& visitor, CalibrationConfig& calibration) {
+  visitor.integer("timeout_s", calibration.timeout_s, 10, 86400);
+  visitor.section("board", [&](auto& section) {
+    CalibrationBoard& board = calibration.board;
+    section.integer("squares_x", board.squares_x, 3, 100);
+    section.integer("squares_y", board.squares_y, 3, 100);
+    section.number("square_m", board.square_m, 0.001, 1);
+    section.number("marker_m", board.marker_m, 0.0005, 1);
+    section.text("dictionary", board.dictionary, longest_name);
+  });
+}
+
+template <class Visitor>
 void visit_disk(Visitor& visitor, DiskConfig& disk) {
   visitor.integer("reserve_mib", disk.reserve_mib, 0, 10'000'000);
   visitor.integer("limit_mib", disk.limit_mib, 0, 100'000'000);
@@ -373,6 +386,7 @@ void visit_config(Visitor& visitor, BoothConfig& config) {
   visitor.section("api", [&](auto& section) { visit_api(section, config.api); });
   visitor.section("capture", [&](auto& section) { visit_capture(section, config.capture); });
   visitor.section("background", [&](auto& section) { visit_background(section, config.background); });
+  visitor.section("calibration", [&](auto& section) { visit_calibration(section, config.calibration); });
   visitor.section("disk", [&](auto& section) { visit_disk(section, config.disk); });
   visitor.section("jobs", [&](auto& section) { visit_jobs(section, config.jobs); });
   visitor.section("log", [&](auto& section) { visit_log(section, config.log); });
@@ -874,6 +888,8 @@ void check_together(const BoothConfig& config, std::vector<ConfigFault>& faults)
       faults.push_back({path, "\"" + endpoint + "\"", "an endpoint that is not used twice"});
   if (config.booth.state_directory.is_relative())
     faults.push_back({"booth.state_directory", config.booth.state_directory.string(), "an absolute path"});
+  if (const CalibrationBoard& board = config.calibration.board; !(board.marker_m < board.square_m))
+    faults.push_back({"calibration.board.marker_m", std::to_string(board.marker_m), "less than square_m"});
   check_cameras(config, faults);
 }
 

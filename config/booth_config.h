@@ -14,6 +14,7 @@
 #include "pipeline/export/avatar_files.h"
 #include "pipeline/reconstruct.h"
 #include "pipeline/types/result.h"
+#include "pipeline/types/shot.h"
 #include "replay/recording_writer.h"
 #include "replay/replay_options.h"
 
@@ -53,6 +54,13 @@ struct BackgroundConfig {
   double max_light_factor = 1.5;  ///< by how much the light may have changed since it was learned, 1.05 … 10
   bool relearn = true;            ///< the booth learns it again by itself when nobody is in it
   int quiet_s = 60;               ///< so long after the last capture it is taken to be empty, 5 … 86400
+};
+
+struct CalibrationConfig {
+  /// That is shown to the cameras; where everything is played from a recording, that of its shots counts.
+  CalibrationBoard board{
+      .squares_x = 8, .squares_y = 11, .square_m = 0.06, .marker_m = 0.045, .dictionary = "DICT_5X5_250"};
+  int timeout_s = 3600;  ///< after which a solution is stopped and has failed, 10 … 86400
 };
 
 struct DiskConfig {
@@ -124,6 +132,7 @@ struct BoothConfig {
   ApiConfig api;
   CaptureConfig capture;
   BackgroundConfig background;
+  CalibrationConfig calibration;
   DiskConfig disk;
   JobsConfig jobs;
   LogConfig log;

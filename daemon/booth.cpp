@@ -81,6 +81,7 @@ Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<D
   if (const auto locked = booth->lock_state(); !locked) return locked.error();
   if (const auto opened = booth->open_stores(); !opened) return opened.error();
   booth->measure_disk();
+  if (const auto opened = booth->open_calibration(devices); !opened) return opened.error();
   if (devices) {
     booth->open_capture(*devices);
   } else {
@@ -117,6 +118,7 @@ Booth::~Booth() {
   eraser_.reset();
   runner_.reset();
   session_.reset();
+  calibration_desk_.reset();
   cameras_.reset();
   previews_.reset();
   if (warnings_) warnings_->listen({});
@@ -154,6 +156,41 @@ Result<void> Booth::open_stores() {
   if (!backgrounds) return backgrounds.error();
   backgrounds_ = std::move(*backgrounds);
   return {};
+}
+
+/// @param devices  of a recording that is played, the board is that of its shots
+Result<void> Booth::open_calibration(const Result<Devices>& devices) {
+  CalibrationDeskOptions options{.folder = options_.config.booth.rig().parent_path(),
+                                 .command = options_.calibrate_command,
+                                 .board = options_.config.calibration.board,
+                                 .images = options_.config.capture.images,
+                                 .timeout = std::chrono::seconds(options_.config.calibration.timeout_s)};
+  if (devices && devices->replayed)
+    if (const Shot* shot = devices->replayed->find(ShotRole::calibration_board); shot != nullptr && shot->board)
+      options.board = *shot->board;
+  auto opened = CalibrationDesk::open(
+      std::move(options), tasks_,
+      [this] {
+        const std::lock_guard lock(rig_mutex_);
+        return RigInForce{rig_, calibration_.created};
+      },
+      [this](const RigInForce& rig) {
+        set_rig(rig);
+        health_.calibrated();
+        refresh();
+      });
+  if (!opened) return opened.error();
+  calibration_desk_ = std::move(*opened);
+  return {};
+}
+
+void Booth::set_rig(const RigInForce& rig) {
+  const std::lock_guard lock(rig_mutex_);
+  rig_fault_.clear();
+  rig_ = rig.rig;
+  calibration_ = {.loaded = true, .rms_px = {}, .created = rig.created};
+  for (const RigCamera& camera : rig_->cameras)
+    if (camera.rms_px) calibration_.rms_px = std::max(calibration_.rms_px.value_or(0), *camera.rms_px);
 }
 
 void Booth::open_capture(const Devices& devices) {
@@ -198,6 +235,8 @@ void Booth::open_capture(const Devices& devices) {
                    .cameras = *cameras_,
                    .tasks = tasks_,
                    .backgrounds = *backgrounds_,
+                   .calibration = *calibration_desk_,
+                   .devices = [this] { return this->devices(); },
                    .jobs = *jobs_,
                    .events = events_,
                    .metrics = metrics_,
@@ -215,16 +254,9 @@ void Booth::open_capture(const Devices& devices) {
 }
 
 void Booth::load_rig(const Devices& devices) {
+  if (devices.rig) return set_rig({std::make_shared<const Rig>(*devices.rig), devices.rig_created});
   const std::lock_guard lock(rig_mutex_);
   rig_fault_ = devices.rig_fault;
-  calibration_ = {};
-  rig_.reset();
-  if (!devices.rig) return;
-  rig_ = std::make_shared<const Rig>(*devices.rig);
-  calibration_.loaded = true;
-  calibration_.created = devices.rig_created;
-  for (const RigCamera& camera : rig_->cameras)
-    if (camera.rms_px) calibration_.rms_px = std::max(calibration_.rms_px.value_or(0), *camera.rms_px);
 }
 
 std::shared_ptr<const Rig> Booth::rig() const {
@@ -398,6 +430,27 @@ Result<std::string> Booth::calibrate_projector() {
   return session_->calibrate_projector();
 }
 
+/// A booth that is not calibrated, or has no background yet, needs neither for it.
+Result<std::string> Booth::capture_board(const BoardRequest& request) {
+  if (const auto ready = check_ready({"not_calibrated", "no_background"}); !ready) return ready.error();
+  return session_->capture_board(request);
+}
+
+std::vector<BoothDevice> Booth::devices() const {
+  std::vector<BoothDevice> devices;
+  const auto rig = this->rig();
+  for (const CameraStatus& camera : cameras_->status()) {
+    BoothDevice& device = devices.emplace_back(BoothDevice{.id = camera.id, .role = camera.role});
+    if (const RigCamera* calibrated = rig ? rig->find(camera.id) : nullptr; calibrated != nullptr)
+      device.mount_rotation_deg = calibrated->mount_rotation_deg;
+    // 0 may mean that nobody has said anything.
+    if (const auto configured = mount_rotations_.find(camera.id);
+        configured != mount_rotations_.end() && configured->second != 0)
+      device.mount_rotation_deg = configured->second;
+  }
+  return devices;
+}
+
 Result<void> Booth::start_preview(const std::string& camera, PreviewSettings settings) {
   if (cameras_ == nullptr || !cameras_->has(camera)) return Error{ErrorCode::not_found, "there is no camera " + camera};
   const auto rig = this->rig();
@@ -524,6 +577,7 @@ BoothStatus Booth::status() const {
   }
   status.tasks = tasks_.list();
   status.calibration.moved = health_.moved();
+  status.calibration.session = calibration_desk_->session();
   if (const auto background = backgrounds_->current()) {
     status.background = {.learned = true, .created = background->created, .stale = health_.staleness(background_age())};
   }

@@ -15,6 +15,7 @@
 #include "config/booth_config.h"
 #include "daemon/avatar_store.h"
 #include "daemon/background_store.h"
+#include "daemon/calibration_desk.h"
 #include "daemon/camera_supervisor.h"
 #include "daemon/capture_session.h"
 #include "daemon/eraser.h"
@@ -61,6 +62,7 @@ struct BoothOptions {
   BoothConfig config;
   std::filesystem::path config_file;          ///< handed to the reconstruction; may be empty
   std::filesystem::path reconstruct_command;  ///< see JobRunnerOptions::command
+  std::filesystem::path calibrate_command;    ///< see CalibrationDeskOptions::command
   DelayCalibrationOptions delay_calibration = {.max_delay_ms = 300, .repeats = 3};  ///< some ten seconds
 };
 
@@ -69,6 +71,7 @@ struct CalibrationStatus {
   std::optional<double> rms_px;         ///< the worst camera's
   std::string created;                  ///< may be empty
   std::vector<std::string> moved = {};  ///< cameras that the latest capture shows not to stand where they were
+  std::optional<CalibrationSessionStatus> session = {};  ///< of the calibration under way
 };
 struct BackgroundStatus {
   bool learned = false;
@@ -133,6 +136,11 @@ class Booth {
   /// hold still. @error busy, not_ready; unsupported  the booth has no projector on a display output
   Result<std::string> calibrate_projector();
 
+  /// Takes a shot of the calibration board. @error busy, not_ready, disk_full, device_lost, unsupported
+  Result<std::string> capture_board(const BoardRequest& request);
+  /// Its shots are solved and a solution put in force here.
+  CalibrationDesk& calibration() { return *calibration_desk_; }
+
   /// @param settings  its rotation is the camera's own. @error not_found  no such camera
   Result<void> start_preview(const std::string& camera, PreviewSettings settings);
   Result<void> stop_preview(const std::string& camera);
@@ -169,6 +177,9 @@ class Booth {
   void refresh();
   CamerasDiscovered look_for_cameras() const;
   void load_rig(const Devices& devices);
+  void set_rig(const RigInForce& rig);
+  Result<void> open_calibration(const Result<Devices>& devices);
+  std::vector<BoothDevice> devices() const;
   std::vector<Reason> find_reasons(BoothState state) const;
   void find_calibration_reasons(std::vector<Reason>& reasons) const;
   Result<void> check_ready(const std::vector<std::string>& tolerated) const;
@@ -196,6 +207,7 @@ class Booth {
   CalibrationStatus calibration_;   ///< guarded by rig_mutex_
   std::string rig_fault_;           ///< guarded by rig_mutex_
   std::map<std::string, int> mount_rotations_;
+  std::unique_ptr<CalibrationDesk> calibration_desk_;
   bool background_is_played_ = false;                        ///< it is that of a recording, and does not grow old
   std::chrono::steady_clock::time_point next_relearning_{};  ///< of the housekeeper
   std::string device_fault_;                                 ///< why there are no devices; empty when there are

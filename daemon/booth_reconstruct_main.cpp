@@ -17,6 +17,7 @@
 
 #include "config/booth_config.h"
 #include "daemon/face_model_loader.h"
+#include "daemon/progress_pipe.h"
 #include "daemon/reconstruct_job.h"
 #include "pipeline/thread_pool.h"
 #include "replay/recording.h"
@@ -52,25 +53,6 @@ class ProgressBar {
   int percent_ = -1;
   std::string stage_;
   bool drawn_ = false;
-};
-
-/// The job's news for the process that started this one: a JSON object a line.
-class ProgressPipe {
- public:
-  explicit ProgressPipe(int descriptor) : descriptor_(descriptor) {}
-  void tell(const nlohmann::json& news) const {
-    if (descriptor_ < 0) return;
-    const std::string line = news.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace) + "\n";
-    for (size_t sent = 0; sent < line.size();) {
-      const ssize_t count = write(descriptor_, line.data() + sent, line.size() - sent);
-      if (count < 0 && errno == EINTR) continue;
-      if (count <= 0) return;  // the reader is gone; the avatar on disk is what counts
-      sent += static_cast<size_t>(count);
-    }
-  }
-
- private:
-  int descriptor_;
 };
 
 /// Turns SIGINT and SIGTERM into a stop request, so that a job that is ended leaves no half-made folder.

@@ -131,6 +131,7 @@ int run(const Arguments& arguments) {
   BoothOptions options;
   options.reconstruct_command = arguments.reconstruct_command.empty() ? beside_this_program("booth-reconstruct")
                                                                       : fs::absolute(arguments.reconstruct_command);
+  options.calibrate_command = beside_this_program("booth-calibrate");
   set_up_log(LogLevel::info);
   if (!arguments.config_file.empty()) {
     options.config_file = fs::absolute(arguments.config_file);

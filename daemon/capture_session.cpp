@@ -90,6 +90,7 @@ std::optional<std::string> CaptureSession::occupation() const {
   if (std::holds_alternative<TriggerTestRequest>(operation_->request)) return "the trigger is being tested";
   if (std::holds_alternative<ProjectorCalibrationRequest>(operation_->request))
     return "the projector is being calibrated";
+  if (std::holds_alternative<BoardRequest>(operation_->request)) return "a shot of the board is being taken";
   return "capture " + operation_->id + " is under way";
 }
 
@@ -322,7 +323,7 @@ Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& r
   }
   std::vector<Frame> face;
   if (patterns_wanted(request.face)) {
-    auto taken = take_face(id, cancelled);
+    auto taken = take_patterns(id, parts_.cameras.ids(CameraRole::face), cancelled);
     if (taken)
       face = std::move(*taken);
     else if (request.face == FaceMode::active || cancelled.stop_requested())
@@ -464,7 +465,8 @@ bool CaptureSession::patterns_wanted(FaceMode mode) {
 
 /// Pattern by pattern, and at the end once more those that a camera missed that is back. Frames come back with the
 /// pattern's index.
-Result<std::vector<Frame>> CaptureSession::take_face(const std::string& id, const std::stop_token& cancelled) {
+Result<std::vector<Frame>> CaptureSession::take_patterns(const std::string& id, const std::vector<std::string>& cameras,
+                                                         const std::stop_token& cancelled) {
   const auto opened = projector_->get();
   if (!opened) return Error{ErrorCode::device_lost, "the projector cannot be used: " + opened.error().message};
   // Nobody is left in a flickering light, whichever way this ends.
@@ -478,22 +480,22 @@ Result<std::vector<Frame>> CaptureSession::take_face(const std::string& id, cons
   const int patterns = pattern_count(lit.projector->info().pattern);
   int repeats_left = most_repeats;
   std::vector<std::map<std::string, Frame>> delivered(static_cast<size_t>(patterns));  // by pattern and camera
-  const auto take_all = [&](const std::vector<std::string>& cameras, bool again) -> Result<void> {
-    FrameCollector collector = arm(cameras, ShotRole::gray_code, patterns + most_repeats);
+  const auto take_all = [&](const std::vector<std::string>& asked, bool again) -> Result<void> {
+    FrameCollector collector = arm(asked, ShotRole::gray_code, patterns + most_repeats);
     collector.wait_armed(parts_.clock.now() + arm_patience, cancelled);
     for (int pattern = 0; pattern < patterns; ++pattern) {
       auto& frames = delivered[static_cast<size_t>(pattern)];
-      if (has_all(frames, cameras)) continue;
-      const auto taken =
-          take_pattern(id, *lit.projector, {pattern, cameras, again}, frames, collector, repeats_left, cancelled);
+      if (has_all(frames, asked)) continue;
+      const auto taken = take_pattern(id, *lit.projector, {pattern, asked, cameras, again}, frames, collector,
+                                      repeats_left, cancelled);
       if (!taken) return taken;
     }
     return {};
   };
-  auto taken = take_all(parts_.cameras.ids(CameraRole::face), false);
+  auto taken = take_all(cameras, false);
   const Timestamp deadline = parts_.clock.now() + return_patience;
   while (taken) {
-    const auto returned = wait_returned(delivered, deadline, cancelled);
+    const auto returned = wait_returned(cameras, delivered, deadline, cancelled);
     if (returned.empty() || parts_.clock.now() >= deadline) break;
     taken = take_all(returned, true);
     // One that is lost again, or only now found to be lost, may come back yet.
@@ -514,10 +516,11 @@ Result<std::vector<Frame>> CaptureSession::take_face(const std::string& id, cons
 
 /// The cameras that missed patterns though they took others, and are online: those that were lost are waited for until
 /// `deadline`, as their frames so far are worth nothing without the rest.
-std::vector<std::string> CaptureSession::wait_returned(const std::vector<std::map<std::string, Frame>>& delivered,
+std::vector<std::string> CaptureSession::wait_returned(const std::vector<std::string>& cameras,
+                                                       const std::vector<std::map<std::string, Frame>>& delivered,
                                                        Timestamp deadline, const std::stop_token& cancelled) {
   std::vector<std::string> incomplete;
-  for (const std::string& camera : parts_.cameras.ids(CameraRole::face)) {
+  for (const std::string& camera : cameras) {
     const auto count =
         std::count_if(delivered.begin(), delivered.end(), [&](const auto& frames) { return frames.contains(camera); });
     if (count > 0 && count < static_cast<std::ptrdiff_t>(delivered.size())) incomplete.push_back(camera);
@@ -553,7 +556,7 @@ Result<void> CaptureSession::take_pattern(const std::string& id, Projector& proj
   for (;; ++report.retries, --repeats_left) {
     if (cancelled.stop_requested()) return was_cancelled();
     if (collector.reachable() == 0)
-      return Error{ErrorCode::not_ready, "no face camera takes the projected patterns: " + join(wanted.cameras)};
+      return Error{ErrorCode::not_ready, "no camera takes the projected patterns: " + join(wanted.cameras)};
     if (const auto shown = projector.show(wanted.pattern); !shown)
       return Error{ErrorCode::io, "the projector failed: " + shown.error().message};
     auto shot = fire_and_collect(collector, ShotRole::gray_code, cancelled);
@@ -571,7 +574,7 @@ Result<void> CaptureSession::take_pattern(const std::string& id, Projector& proj
   }
   parts_.metrics.add("shot_retries", report.retries);
   report.cameras = static_cast<int>(delivered.size());
-  for (const std::string& camera : parts_.cameras.ids(CameraRole::face))
+  for (const std::string& camera : wanted.all)
     if (!delivered.contains(camera)) report.missing.push_back(camera);
   report.decided_ms = 1e3 * elapsed_s(begun, parts_.clock.now());
   parts_.events.publish(report);

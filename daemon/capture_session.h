@@ -16,6 +16,7 @@
 
 #include "config/booth_config.h"
 #include "daemon/background_store.h"
+#include "daemon/calibration_desk.h"
 #include "daemon/camera_supervisor.h"
 #include "daemon/device_slot.h"
 #include "daemon/empty_booth.h"
@@ -51,6 +52,12 @@ struct TriggerTestRequest {};
 /// The projector's delay is to be measured.
 struct ProjectorCalibrationRequest {};
 
+/// A shot of the calibration board is to be taken.
+struct BoardRequest {
+  bool floor = false;     ///< the board lies on the floor where the subject stands
+  bool patterns = false;  ///< the projector lights it with its patterns, so that it is calibrated too
+};
+
 /// What a capture works with; all of it outlives the session.
 struct CaptureParts {
   CaptureConfig config;
@@ -64,6 +71,8 @@ struct CaptureParts {
   CameraSupervisor& cameras;
   TaskBoard& tasks;
   BackgroundStore& backgrounds;
+  CalibrationDesk& calibration;
+  std::function<std::vector<BoothDevice>()> devices;  ///< every camera
   JobQueue& jobs;
   EventBus& events;
   Metrics& metrics;
@@ -90,6 +99,8 @@ class CaptureSession {
   Result<std::string> test_trigger();
   /// Likewise. @error busy; unsupported  there is no projector whose flips are known
   Result<std::string> calibrate_projector();
+  /// Likewise. @error busy; unsupported  patterns are wanted and there is no projector
+  Result<std::string> capture_board(const BoardRequest& request);
   /// @error invalid_state  it is over, or can no longer be stopped; not_found
   Result<void> cancel(const std::string& id);
   /// Of a capture under way nothing will remain, whatever it has done so far. Others: nothing happens.
@@ -109,7 +120,8 @@ class CaptureSession {
   void drain(std::chrono::milliseconds patience);
 
  private:
-  using Request = std::variant<CaptureRequest, BackgroundRequest, TriggerTestRequest, ProjectorCalibrationRequest>;
+  using Request =
+      std::variant<CaptureRequest, BackgroundRequest, TriggerTestRequest, ProjectorCalibrationRequest, BoardRequest>;
   /// The one thing that is under way.
   struct Operation {
     std::string id;  ///< the capture's, or the task's
@@ -135,12 +147,15 @@ class CaptureSession {
   Result<void> count_down(const std::string& id, Timestamp until, Timestamp zero, double& next_s,
                           const std::stop_token& cancelled);
   Result<CollectedShot> take_body(const std::string& id, FrameCollector& collector, const std::stop_token& cancelled);
-  Result<std::vector<Frame>> take_face(const std::string& id, const std::stop_token& cancelled);
-  std::vector<std::string> wait_returned(const std::vector<std::map<std::string, Frame>>& delivered, Timestamp deadline,
+  Result<std::vector<Frame>> take_patterns(const std::string& id, const std::vector<std::string>& cameras,
+                                           const std::stop_token& cancelled);
+  std::vector<std::string> wait_returned(const std::vector<std::string>& cameras,
+                                         const std::vector<std::map<std::string, Frame>>& delivered, Timestamp deadline,
                                          const std::stop_token& cancelled);
   struct WantedPattern {
     int pattern = 0;
     const std::vector<std::string>& cameras;  ///< from which
+    const std::vector<std::string>& all;      ///< that are to have it in the end
     bool again = false;                       ///< it was shown before
   };
   Result<void> take_pattern(const std::string& id, Projector& projector, const WantedPattern& wanted,
@@ -155,6 +170,7 @@ class CaptureSession {
   Result<TaskResult> work(const std::string& task, const TriggerTestRequest& request, const std::stop_token& cancelled);
   Result<TaskResult> work(const std::string& task, const ProjectorCalibrationRequest& request,
                           const std::stop_token& cancelled);
+  Result<TaskResult> work(const std::string& task, const BoardRequest& request, const std::stop_token& cancelled);
   using Views = std::map<std::string, std::vector<CoarseView>>;  ///< by camera, in their order
   Result<Views> take_background(const std::string& task, int frames, RecordingWriter& writer,
                                 const std::stop_token& cancelled);

@@ -126,15 +126,24 @@ CombinedParts::OpenProjector projector_of(const ProjectorConfig& config, const s
   return {};
 }
 
+/// Whether the booth's own calibration is one of the cameras that the recording has.
+bool fits(const Rig& own, const Rig& recorded) {
+  return std::all_of(recorded.cameras.begin(), recorded.cameras.end(), [&](const RigCamera& camera) {
+    const RigCamera* same = own.find(camera.id);
+    return same != nullptr && same->role == camera.role && same->intrinsics.width == camera.intrinsics.width &&
+           same->intrinsics.height == camera.intrinsics.height;
+  });
+}
+
 /// The booth's own calibration, where it has one; else the recording's, where one is played.
 void find_rig(const BoothConfig& config, const Drivers& drivers, Devices& devices) {
   const auto take_replayed = [&] {
     devices.rig = *drivers.replay->rig();
     devices.rig_created = drivers.replay->recording().created;
   };
-  if (config.cameras.empty()) return take_replayed();
   const std::filesystem::path file = config.booth.rig();
   const auto rig = read_rig(file);
+  if (config.cameras.empty() && (!rig || !fits(*rig, *drivers.replay->rig()))) return take_replayed();
   if (rig) {
     devices.rig = *rig;
     struct stat status {};

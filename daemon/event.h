@@ -123,8 +123,12 @@ struct ProjectorCalibrated {
   double contrast = 0;  ///< of white and black, of 255
   std::string camera;   ///< that looked
 };
-using TaskResult =
-    std::variant<std::monostate, CamerasDiscovered, BackgroundLearned, TriggerTested, ProjectorCalibrated>;
+/// What became of a shot of the board, or of solving: see CalibrationDesk.
+struct CalibrationReport {
+  std::string json;  ///< an object, as the interface hands it on
+};
+using TaskResult = std::variant<std::monostate, CamerasDiscovered, BackgroundLearned, TriggerTested,
+                                ProjectorCalibrated, CalibrationReport>;
 struct TaskChanged {
   std::string task;
   TaskKind kind;

@@ -4,17 +4,15 @@
 #include <pthread.h>
 #include <spdlog/spdlog.h>
 #include <sys/wait.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <array>
-#include <cerrno>
 #include <exception>
 #include <nlohmann/json.hpp>
 #include <optional>
-#include <string_view>
 #include <utility>
 
+#include "daemon/child_output.h"
 #include "daemon/child_process.h"
 #include "replay/durable_folder.h"
 
@@ -26,64 +24,7 @@ using SteadyClock = std::chrono::steady_clock;
 
 constexpr std::chrono::milliseconds step{50};            ///< how soon a cancelled job's process is killed
 constexpr std::chrono::milliseconds publish_pause{100};  ///< between two progress events of a job
-constexpr size_t longest_line = 4096;                    ///< of the progress protocol; more is not ours
 constexpr size_t most_cameras = 1024;                    ///< of which a process may tell the health
-constexpr size_t longest_output = 8192;                  ///< of the process's own words that are kept: the last ones
-
-/// Splits what comes through a pipe into lines; one that is too long is dropped.
-class LineReader {
- public:
-  /// Reads what is there. @return false at the end of the pipe
-  template <class OnLine>
-  bool read(int descriptor, const OnLine& on_line) {
-    std::array<char, 4096> bytes;
-    for (;;) {
-      const ssize_t got = ::read(descriptor, bytes.data(), bytes.size());
-      if (got < 0 && errno == EINTR) continue;
-      if (got < 0) return true;  // nothing more for now
-      if (got == 0) return false;
-      for (const char byte : std::string_view(bytes.data(), static_cast<size_t>(got))) {
-        if (byte != '\n') {
-          if (line_.size() <= longest_line) line_ += byte;
-          continue;
-        }
-        if (line_.size() <= longest_line) on_line(line_);
-        line_.clear();
-      }
-    }
-  }
-  const std::string& rest() const { return line_; }
-
- private:
-  std::string line_;
-};
-
-/// The last words of a process.
-class Tail {
- public:
-  bool read(int descriptor) {
-    std::array<char, 4096> bytes;
-    for (;;) {
-      const ssize_t got = ::read(descriptor, bytes.data(), bytes.size());
-      if (got < 0 && errno == EINTR) continue;
-      if (got < 0) return true;
-      if (got == 0) return false;
-      text_.append(bytes.data(), static_cast<size_t>(got));
-      if (text_.size() > 2 * longest_output) text_.erase(0, text_.size() - longest_output);
-    }
-  }
-  std::string last_line() const {
-    const size_t end = text_.find_last_not_of(" \r\n");
-    if (end == std::string::npos) return {};
-    const size_t begin = text_.find_last_of('\n', end);
-    return text_.substr(begin == std::string::npos ? 0 : begin + 1,
-                        end - (begin == std::string::npos ? 0 : begin + 1) + 1);
-  }
-  const std::string& text() const { return text_; }
-
- private:
-  std::string text_;
-};
 
 std::string text_of(const Json& object, const char* key, const char* otherwise) {
   const auto found = object.find(key);

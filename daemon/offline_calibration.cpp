@@ -1,14 +1,12 @@
 #include "daemon/offline_calibration.h"
 
 #include <algorithm>
-#include <charconv>
 #include <nlohmann/json.hpp>
-#include <set>
 
+#include "daemon/board_shots.h"
+#include "pipeline/calibration/coverage.h"
 #include "pipeline/calibration/report.h"
 #include "pipeline/calibration/world_frame.h"
-#include "pipeline/image/develop.h"
-#include "pipeline/structured_light/gray_code.h"
 #include "replay/durable_folder.h"
 #include "replay/recording.h"
 
@@ -20,73 +18,36 @@ bool same_board(const CalibrationBoard& a, const CalibrationBoard& b) {
          a.marker_m == b.marker_m && a.dictionary == b.dictionary;
 }
 
-/// N of "board-N".
-std::optional<int> board_index(const std::string& shot) {
-  constexpr std::string_view prefix = "board-";
-  if (!shot.starts_with(prefix)) return std::nullopt;
-  int index = 0;
-  const char* end = shot.data() + shot.size();
-  const auto [stop, fault] = std::from_chars(shot.data() + prefix.size(), end, index);
-  if (fault != std::errc() || stop != end || index < 0) return std::nullopt;
-  return index;
+/// Those that the recording's rig has; cameras that come and go between recordings are of one rig all the same where
+/// `more` may be added.
+Result<void> add_devices(const Recording& recording, bool more, std::vector<CalibrationDevice>& devices) {
+  const auto own = calibration_devices(recording.rig);
+  const Error differs{ErrorCode::invalid_argument,
+                      recording.folder.string() + ": has other cameras than the first recording"};
+  if (!more && own.size() != devices.size()) return differs;
+  for (const CalibrationDevice& device : own) {
+    const auto known = std::find_if(devices.begin(), devices.end(), [&](const auto& d) { return d.id == device.id; });
+    if (known == devices.end() && !more) return differs;
+    if (known == devices.end())
+      devices.push_back(device);
+    else if (known->width != device.width || known->height != device.height)
+      return Error{ErrorCode::invalid_argument,
+                   recording.folder.string() + ": the pictures of " + device.id + " have another size than before"};
+  }
+  return {};
 }
 
-/// The boards that the cameras see in one shot, poses numbered from `first_pose` by index.
-Result<std::vector<BoardView>> find_boards(const Recording& recording, const Shot& shot, int first_pose,
-                                           std::vector<std::string>& messages, const Work& work) {
-  LoadedShot loaded = load_shot(recording, shot, work);
-  messages.insert(messages.end(), loaded.faults.begin(), loaded.faults.end());
-  std::vector<const Frame*> frames;
-  for (const FrameSet& set : loaded.sets)
-    for (const Frame& frame : set.frames) frames.push_back(&frame);
-  std::vector<std::optional<Result<BoardView>>> found(frames.size());
-  work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
-    for (size_t i = begin; i < end && !work.stopped(); ++i) {
-      const auto frame = develop(*frames[i]);
-      if (frame)
-        found[i] = find_board(frame->camera, first_pose + frame->index, *frame->pixels, *shot.board);
-      else
-        found[i] = frame.error();
-    }
-  });
-  if (work.stopped()) return Work::cancelled();
-  std::vector<BoardView> views;
-  for (auto& view : found) {
-    if (!*view) return view->error();
-    views.push_back(std::move(**view));
-  }
-  return views;
-}
-
-/// Of each Gray-code shot of the board, the projector's view by the camera that decoded most corners.
-Result<std::vector<BoardView>> projector_views(const Recording& recording, const std::vector<BoardView>& views,
-                                               int first_pose, std::vector<std::string>& messages, const Work& work) {
-  std::vector<BoardView> best;
-  for (const Shot& shot : recording.shots) {
-    const auto index = board_index(shot.name);
-    if (shot.role != ShotRole::gray_code || !shot.pattern || !index) continue;
-    const LoadedShot loaded = load_shot(recording, shot, work);
-    messages.insert(messages.end(), loaded.faults.begin(), loaded.faults.end());
-    std::optional<BoardView> most;
-    for (const BoardView& view : views) {
-      if (view.pose != first_pose + *index || view.corners.empty()) continue;
-      std::vector<Frame> frames;
-      for (const FrameSet& set : loaded.sets)
-        for (const Frame& frame : set.frames)
-          if (frame.camera == view.camera) frames.push_back(frame);
-      if (frames.empty()) continue;
-      const auto decoded = decode_gray_code(frames, *shot.pattern, nullptr, {}, work);
-      if (!decoded) {
-        messages.push_back(shot.name + ": " + view.camera + ": " + decoded.error().message);
-        continue;
-      }
-      auto lit = projector_view(view, decoded->position, decoded->sigma, recording.rig.projector->id);
-      if (!lit) return lit.error();
-      if (!most || lit->corners.size() > most->corners.size()) most = std::move(*lit);
-    }
-    if (most) best.push_back(std::move(*most));
-  }
-  return best;
+/// Whether the device has a calibration that can go on without the board, which it did not see: blurred pictures are
+/// no such thing.
+bool may_stay_unseen(const CalibrationDevice& device, const CalibrationInput& input) {
+  if (std::any_of(input.views.begin(), input.views.end(), [&](const BoardView& view) {
+        return view.camera == device.id && (!view.corners.empty() || view.blurred);
+      }))
+    return false;
+  if (!input.previous) return false;
+  const CalibratedView* before = input.previous->find(device.id);
+  if (device.projector && input.previous->projector) before = &*input.previous->projector;
+  return before != nullptr && before->intrinsics.width == device.width && before->intrinsics.height == device.height;
 }
 
 struct Gathered {
@@ -102,19 +63,10 @@ Result<Gathered> gather(const OfflineCalibrationOptions& options, const Work& wo
   for (const auto& folder : options.recordings) {
     const auto recording = read_recording(folder);
     if (!recording) return recording.error();
-    const bool first = !input.previous;
-    if (first) {
-      input.previous = recording->rig;
-      input.devices = calibration_devices(recording->rig);
-    }
-    const auto devices = calibration_devices(recording->rig);
-    const bool same =
-        devices.size() == input.devices.size() &&
-        std::equal(devices.begin(), devices.end(), input.devices.begin(), [](const auto& a, const auto& b) {
-          return a.id == b.id && a.width == b.width && a.height == b.height;
-        });
-    if (!same)
-      return Error{ErrorCode::invalid_argument, folder.string() + ": has other cameras than the first recording"};
+    const bool first = &folder == &options.recordings.front();
+    if (first) input.previous = options.nominal ? options.previous : recording->rig;
+    if (const auto added = add_devices(*recording, first || options.nominal, input.devices); !added)
+      return added.error();
     bool first_shot = true;
     for (const Shot& shot : recording->shots) {
       if (shot.role != ShotRole::calibration_board) continue;
@@ -130,7 +82,7 @@ Result<Gathered> gather(const OfflineCalibrationOptions& options, const Work& wo
       if (recording->rig.projector && first_shot) {
         auto lit = projector_views(*recording, *views, next_pose, gathered.messages, work);
         if (!lit) return lit.error();
-        projector_seen |= !lit->empty();
+        projector_seen |= std::any_of(lit->begin(), lit->end(), [](const auto& view) { return !view.corners.empty(); });
         std::move(lit->begin(), lit->end(), std::back_inserter(input.views));
       }
       if (shot.name == "floor") input.floor_pose = next_pose;
@@ -146,10 +98,7 @@ Result<Gathered> gather(const OfflineCalibrationOptions& options, const Work& wo
   // Without patterns on the board nothing is known of the projector: it is not asked for.
   if (!projector_seen) std::erase_if(input.devices, [](const auto& device) { return device.projector; });
   if (options.keep_unseen)
-    std::erase_if(input.devices, [&](const CalibrationDevice& device) {
-      return std::none_of(input.views.begin(), input.views.end(),
-                          [&](const BoardView& view) { return view.camera == device.id && !view.corners.empty(); });
-    });
+    std::erase_if(input.devices, [&](const CalibrationDevice& device) { return may_stay_unseen(device, input); });
   return gathered;
 }
 
@@ -170,11 +119,17 @@ void keep_unseen(const Rig& previous, Calibration& solved) {
     solved.rig.projector->camera_from_world = previous.projector->camera_from_world * old_from_new;
     kept += (kept.empty() ? "" : ", ") + previous.projector->id;
   }
-  if (!kept.empty()) solved.messages.push_back("never saw the board and keep their previous calibration: " + kept);
+  if (kept.empty()) return;
+  solved.messages.push_back("never saw the board and keep their previous calibration: " + kept);
+  // Nobody looked whether they still stand where they stood.
+  if (solved.verdict != CalibrationVerdict::good) return;
+  solved.verdict = CalibrationVerdict::usable;
+  solved.reason = solved.messages.back();
 }
 
-std::string figures_json(const Calibration& calibration) {
+std::string figures_json(const Calibration& calibration, const CalibrationInput& input) {
   using Json = nlohmann::ordered_json;
+  const Coverage coverage = assess_coverage(input.devices, input.board, input.views);
   Json json;
   json["format"] = "booth-calibration";
   json["version"] = 1;
@@ -184,8 +139,11 @@ std::string figures_json(const Calibration& calibration) {
   json["poses"] = calibration.poses;
   json["messages"] = calibration.messages;
   json["devices"] = Json::array();
-  for (const DeviceQuality& device : calibration.devices)
+  for (size_t i = 0; i < calibration.devices.size(); ++i) {
+    const DeviceQuality& device = calibration.devices[i];
+    const CameraCoverage& seen = coverage.cameras[i];
     json["devices"].push_back({{"id", device.id},
+                               {"projector", input.devices[i].projector},
                                {"solved", device.solved},
                                {"rms_px", device.rms_px},
                                {"views", device.views},
@@ -195,7 +153,12 @@ std::string figures_json(const Calibration& calibration) {
                                {"rotation_sigma_rad", device.pose.rotation_rad},
                                {"focal_sigma_px", device.focal_sigma_px},
                                {"principal_point_sigma_px", device.principal_point_sigma_px},
+                               {"covered", seen.covered},
+                               {"shared_views", seen.shared_views},
+                               {"enough", seen.enough},
+                               {"wants", seen.wants.empty() ? Json(nullptr) : Json(seen.wants)},
                                {"messages", device.messages}});
+  }
   return json.dump(1) + "\n";
 }
 
@@ -207,7 +170,7 @@ Result<Calibration> calibrate_recordings(const OfflineCalibrationOptions& option
   if (!gathered) return gathered.error();
   auto solved = solve_calibration(gathered->input, options.solver, work);
   if (!solved) return solved.error();
-  if (options.keep_unseen) keep_unseen(*gathered->input.previous, *solved);
+  if (options.keep_unseen && gathered->input.previous) keep_unseen(*gathered->input.previous, *solved);
   solved->messages.insert(solved->messages.end(), gathered->messages.begin(), gathered->messages.end());
   if (const auto valid = check(solved->rig); !valid) return valid.error();
 
@@ -217,7 +180,7 @@ Result<Calibration> calibrate_recordings(const OfflineCalibrationOptions& option
   if (!folder) return folder.error();
   for (const auto& [name, text] : {std::pair{"rig.json", write_rig_json(solved->rig)},
                                    {"report.html", calibration_report_html(*solved, gathered->input)},
-                                   {"calibration.json", figures_json(*solved)}})
+                                   {"calibration.json", figures_json(*solved, gathered->input)}})
     if (const auto written = folder->write(name, text); !written) return written.error();
   if (const auto committed = folder->commit(); !committed) return committed.error();
   return solved;

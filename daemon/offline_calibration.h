@@ -15,7 +15,9 @@ struct OfflineCalibrationOptions {
   std::vector<std::filesystem::path> recordings;  ///< of the same rig; poses of the board add up
   std::filesystem::path out;                      ///< the folder to make; an empty one may be there
   std::optional<int> floor_index;  ///< in the first recording's board shot: the board lies on the floor there
-  bool keep_unseen = false;        ///< devices that never saw the board keep the first recording's calibration
+  bool keep_unseen = false;        ///< devices that never saw the board keep the calibration that they had
+  bool nominal = false;            ///< the recordings' own rigs tell nothing but which devices there are
+  std::optional<Rig> previous;     ///< with `nominal`, the calibration that there was; else the first recording's holds
   CalibrationOptions solver;
 };
 

@@ -61,13 +61,14 @@ Json to_json(const std::optional<DeviceStatus>& device, const char* name) {
           {"fault", fault_of(device->state, device->permanent)}};
 }
 
-Answer unsupported(const std::string& what) {
-  return Error{ErrorCode::unsupported, what + " is not offered by this version"};
-}
-
 Answer task_answer(const Result<std::string>& task) {
   if (!task) return task.error();
   return Reply{{{"task", *task}}};
+}
+
+Json to_json(const std::optional<CalibrationSessionStatus>& session) {
+  if (!session) return nullptr;
+  return {{"shots", session->shots}, {"enough", session->enough}, {"verdict", text_or_null(session->verdict)}};
 }
 
 Json to_json(const std::vector<Task>& tasks) {
@@ -117,7 +118,9 @@ std::optional<Reply> Dispatcher::dispatch(Method method, const Json& params, con
     case Method::calibration_capture:
     case Method::calibration_solve:
     case Method::calibration_apply:
-    case Method::calibration_discard: respond(no_params([] { return unsupported("the calibration"); })); break;
+    case Method::calibration_discard:
+    case Method::calibration_restore:
+    case Method::calibration_status: calibrate(method, params, respond); break;
     case Method::capture_start: respond(start_capture(params)); break;
     case Method::capture_cancel:
       if (const auto request = parse_id(params, "capture"); !refused(request, respond)) {
@@ -169,7 +172,8 @@ Answer Dispatcher::status() const {
                  {{"loaded", status.calibration.loaded},
                   {"rms_px", status.calibration.rms_px ? Json(*status.calibration.rms_px) : Json(nullptr)},
                   {"created", text_or_null(status.calibration.created)},
-                  {"moved", status.calibration.moved}}},
+                  {"moved", status.calibration.moved},
+                  {"session", to_json(status.calibration.session)}}},
                 {"background",
                  {{"learned", status.background.learned},
                   {"created", text_or_null(status.background.created)},
@@ -209,6 +213,44 @@ Answer Dispatcher::learn_background(const Json& params) {
   const auto request = parse_background_learn(params);
   if (!request) return request.error();
   return task_answer(booth_.learn_background(request->frames));
+}
+
+void Dispatcher::calibrate(Method method, const Json& params, const Responder& respond) {
+  CalibrationDesk& desk = booth_.calibration();
+  // Of a request that has been read: what it does waits for the disk.
+  const auto change = [&](const auto& request, const auto& work) {
+    if (refused(request, respond)) return;
+    on_disk(respond, [work, asked = *request]() -> Answer {
+      if (const auto done = work(asked); !done) return done.error();
+      return Reply{};
+    });
+  };
+  switch (method) {
+    case Method::calibration_capture:
+      if (const auto request = parse_calibration_capture(params); !refused(request, respond))
+        respond(task_answer(booth_.capture_board(*request)));
+      break;
+    case Method::calibration_solve:
+      if (const auto request = parse_calibration_solve(params); !refused(request, respond))
+        respond(task_answer(desk.solve(request->keep_unseen)));
+      break;
+    case Method::calibration_apply:
+      change(parse_calibration_apply(params),
+             [&desk](const CalibrationApply& asked) { return desk.apply(asked.force); });
+      break;
+    case Method::calibration_discard:
+      change(parse_calibration_discard(params),
+             [&desk](const CalibrationDiscard& asked) { return desk.discard(asked.shots); });
+      break;
+    case Method::calibration_restore:
+      change(parse_calibration_restore(params),
+             [&desk](const CalibrationRestore& asked) { return desk.restore(asked.name); });
+      break;
+    default:
+      if (const auto request = parse_no_params(params); !refused(request, respond))
+        on_disk(respond, [&desk]() -> Answer { return Reply{Json::parse(desk.report())}; });
+      break;
+  }
 }
 
 Answer Dispatcher::list_jobs(const Json& params) {

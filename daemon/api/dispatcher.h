@@ -51,6 +51,7 @@ class Dispatcher {
   Answer learn_background(const nlohmann::json& params);
   void get_avatar(const nlohmann::json& params, const Responder& respond);
   void fetch_avatar(const nlohmann::json& params, const Responder& respond);
+  void calibrate(Method method, const nlohmann::json& params, const Responder& respond);
   std::optional<Reply> change_job(Method method, const nlohmann::json& params, const Responder& respond);
   std::optional<Reply> remove(Method method, const nlohmann::json& params, const Responder& respond);
 

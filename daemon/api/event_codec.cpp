@@ -93,6 +93,7 @@ Json result_json(const ProjectorCalibrated& calibrated) {
           {"contrast", calibrated.contrast},
           {"camera", calibrated.camera}};
 }
+Json result_json(const CalibrationReport& report) { return Json::parse(report.json); }
 Topic topic_of(const TaskChanged& e) {
   return {"task",
           {{"task", e.task},

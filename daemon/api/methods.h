@@ -22,6 +22,8 @@ enum class Method {
   calibration_solve,
   calibration_apply,
   calibration_discard,
+  calibration_restore,
+  calibration_status,
   capture_start,
   capture_cancel,
   capture_delete,
@@ -40,7 +42,7 @@ struct MethodEntry {
   bool changes;  ///< changes or starts something, and so takes a `key`
 };
 
-inline constexpr std::array<MethodEntry, 24> methods{{
+inline constexpr std::array<MethodEntry, 26> methods{{
     {Method::system_describe, "system.describe", false},
     {Method::system_status, "system.status", false},
     {Method::system_metrics, "system.metrics", false},
@@ -55,6 +57,8 @@ inline constexpr std::array<MethodEntry, 24> methods{{
     {Method::calibration_solve, "calibration.solve", true},
     {Method::calibration_apply, "calibration.apply", true},
     {Method::calibration_discard, "calibration.discard", true},
+    {Method::calibration_restore, "calibration.restore", true},
+    {Method::calibration_status, "calibration.status", false},
     {Method::capture_start, "capture.start", true},
     {Method::capture_cancel, "capture.cancel", true},
     {Method::capture_delete, "capture.delete", true},

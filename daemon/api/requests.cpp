@@ -50,6 +50,13 @@ class Reader {
     refuse(name, *value, expected);
     return std::nullopt;
   }
+  std::optional<bool> flag(const char* name) {
+    const Json* value = find(name);
+    if (value == nullptr) return std::nullopt;
+    if (value->is_boolean()) return value->get<bool>();
+    refuse(name, *value, "true or false");
+    return std::nullopt;
+  }
   std::optional<uint64_t> whole(const char* name, uint64_t least, uint64_t most, const char* expected) {
     const Json* value = find(name);
     if (value == nullptr) return std::nullopt;
@@ -106,6 +113,40 @@ Result<BackgroundLearn> parse_background_learn(const Json& params) {
   BackgroundLearn request;
   if (const auto frames = reader.whole("frames", 1, 100, "1 … 100")) request.frames = static_cast<int>(*frames);
   return reader.finish(request);
+}
+
+Result<BoardRequest> parse_calibration_capture(const Json& params) {
+  Reader reader(params);
+  BoardRequest request;
+  request.floor = reader.flag("floor").value_or(request.floor);
+  request.patterns = reader.flag("patterns").value_or(request.patterns);
+  return reader.finish(request);
+}
+
+Result<CalibrationSolve> parse_calibration_solve(const Json& params) {
+  Reader reader(params);
+  CalibrationSolve request;
+  request.keep_unseen = reader.flag("keep_unseen").value_or(request.keep_unseen);
+  return reader.finish(request);
+}
+
+Result<CalibrationApply> parse_calibration_apply(const Json& params) {
+  Reader reader(params);
+  CalibrationApply request;
+  request.force = reader.flag("force").value_or(request.force);
+  return reader.finish(request);
+}
+
+Result<CalibrationDiscard> parse_calibration_discard(const Json& params) {
+  Reader reader(params);
+  CalibrationDiscard request;
+  request.shots = reader.flag("shots").value_or(request.shots);
+  return reader.finish(request);
+}
+
+Result<CalibrationRestore> parse_calibration_restore(const Json& params) {
+  Reader reader(params);
+  return reader.finish(CalibrationRestore{reader.text("name", 64, "the name of an earlier calibration")});
 }
 
 Result<CaptureRequest> parse_capture_start(const Json& params) {

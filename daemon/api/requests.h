@@ -22,6 +22,18 @@ struct PreviewStart {
 struct BackgroundLearn {
   std::optional<int> frames;
 };
+struct CalibrationSolve {
+  bool keep_unseen = true;
+};
+struct CalibrationApply {
+  bool force = false;
+};
+struct CalibrationDiscard {
+  bool shots = true;
+};
+struct CalibrationRestore {
+  std::optional<std::string> name;
+};
 /// Of the methods that take one id: of a camera, a capture, a job or an avatar.
 struct IdParams {
   std::string id;
@@ -44,6 +56,11 @@ struct AvatarFetch {
 Result<NoParams> parse_no_params(const nlohmann::json& params);
 Result<PreviewStart> parse_preview_start(const nlohmann::json& params);
 Result<BackgroundLearn> parse_background_learn(const nlohmann::json& params);
+Result<BoardRequest> parse_calibration_capture(const nlohmann::json& params);
+Result<CalibrationSolve> parse_calibration_solve(const nlohmann::json& params);
+Result<CalibrationApply> parse_calibration_apply(const nlohmann::json& params);
+Result<CalibrationDiscard> parse_calibration_discard(const nlohmann::json& params);
+Result<CalibrationRestore> parse_calibration_restore(const nlohmann::json& params);
 Result<CaptureRequest> parse_capture_start(const nlohmann::json& params);
 /// @param member  "camera", "capture", "job" or "avatar"
 Result<IdParams> parse_id(const nlohmann::json& params, const char* member);

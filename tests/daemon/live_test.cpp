@@ -344,7 +344,7 @@ TEST_F(Live, WithoutAnyFaceCameraTheSequenceEndsAtOnce) {
   });
   const std::string id = capture({{"face", "active"}});
   EXPECT_EQ(end_of(id), "camera_unavailable");
-  EXPECT_EQ(failure_, "no face camera takes the projected patterns: f0, f1");
+  EXPECT_EQ(failure_, "no camera takes the projected patterns: f0, f1");
   EXPECT_EQ(fake_->shown().back(), -1);
   EXPECT_THAT(traces(id), IsEmpty());
 }
@@ -357,7 +357,7 @@ TEST_F(Live, WhereTheFaceNeedNotBeProjectedTheCaptureGoesOnWithout) {
   const std::string id = capture();
   ASSERT_EQ(end_of(id), "done") << failure_;
   EXPECT_EQ(recording(id).find(ShotRole::gray_code), nullptr);
-  EXPECT_THAT(alerts(), HasSubstr("the face is made without the projector: no face camera takes"));
+  EXPECT_THAT(alerts(), HasSubstr("the face is made without the projector: no camera takes"));
 }
 
 TEST_F(Live, AProjectorThatFailsIsNamedAndOpenedAnew) {
