@@ -33,6 +33,7 @@ constexpr std::chrono::milliseconds step{50};
 constexpr size_t largest_file = size_t{64} << 20;
 constexpr const char* session_name = "session";
 constexpr const char* reports_name = "reports";
+constexpr std::string_view dropped_prefix = "dropped-";
 constexpr std::string_view replaced_prefix = "rig-";
 constexpr std::string_view replaced_suffix = ".json";
 
@@ -163,8 +164,11 @@ Result<void> CalibrationDesk::take_up() {
   if (code) return Error{ErrorCode::io, options_.folder.string() + ": cannot be made: " + code.message()};
   for (const fs::path& folder : {options_.folder, session_.folder(), session_.shots_folder()})
     if (const auto removed = remove_partial_folders(folder); !removed) return removed.error();
-  constexpr size_t one_solution_at_a_time = 1;
-  solver_ = std::make_unique<SerialExecutor>("calibrate", one_solution_at_a_time);
+  constexpr size_t most_waiting = 8;
+  solver_ = std::make_unique<SerialExecutor>("calibrate", most_waiting);
+  for (fs::directory_iterator entry(options_.folder, code), end; !code && entry != end; entry.increment(code))
+    if (const std::string name = entry->path().filename().string(); name.starts_with(dropped_prefix))
+      if (const auto removed = remove_folder(options_.folder, name); !removed) return removed;
   const auto solved = read_solution();
   // It was put in force, and the process ended before it could tidy up.
   const auto current = read_text(rig_file()), applied = read_text(session_.solution() / rig_file().filename());
@@ -456,8 +460,21 @@ Result<void> CalibrationDesk::apply(bool force) {
   fs::create_directories(options_.folder / reports_name, code);
   fs::rename(session_.solution(), options_.folder / reports_name / make_capture_id(now), code);
   if (code) spdlog::warn("{}: cannot be kept: {}", session_.solution().string(), code.message());
-  if (const auto removed = remove_folder(options_.folder, session_name); !removed)
-    spdlog::warn("{}", removed.error().message);
+  if (const auto dropped = drop_session(); !dropped) spdlog::warn("{}", dropped.error().message);
+  return {};
+}
+
+/// The session is gone at once; its pictures, which take a while to delete, soon.
+Result<void> CalibrationDesk::drop_session() {
+  const std::string name = std::string(dropped_prefix) + make_capture_id(std::chrono::system_clock::now());
+  std::error_code code;
+  fs::rename(session_.folder(), options_.folder / name, code);
+  if (code && code != std::errc::no_such_file_or_directory)
+    return Error{ErrorCode::io, session_.folder().string() + ": cannot be removed: " + code.message()};
+  const auto remove = [folder = options_.folder, name] {
+    if (const auto removed = remove_folder(folder, name); !removed) spdlog::warn("{}", removed.error().message);
+  };
+  if (!code && !solver_->post(remove)) remove();
   const std::lock_guard lock(mutex_);
   solution_.reset();
   shots_ = 0;
@@ -475,14 +492,10 @@ Result<void> CalibrationDesk::discard(bool shots) {
   }
   if (const auto occupied = occupy(Occupation::changing); !occupied) return occupied;
   const Occupied until_end(*this);
-  const auto removed = shots ? remove_folder(options_.folder, session_name)
-                             : remove_folder(session_.folder(), session_.solution().filename());
-  if (!removed) return removed;
+  if (shots) return drop_session();
+  if (const auto removed = remove_folder(session_.folder(), session_.solution().filename()); !removed) return removed;
   const std::lock_guard lock(mutex_);
   solution_.reset();
-  if (!shots) return {};
-  shots_ = 0;
-  enough_ = false;
   return {};
 }
 

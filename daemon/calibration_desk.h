@@ -132,6 +132,7 @@ class CalibrationDesk {
                             const std::string& projector) const;
   Result<Solution> carry_out(const std::string& task, bool keep_unseen, const std::stop_token& stop);
   Result<Solution> read_solution() const;
+  Result<void> drop_session();
   Result<void> replace(const Rig& rig, const std::string& created);
   std::filesystem::path rig_file() const { return options_.folder / "rig.json"; }
   void count_shots();

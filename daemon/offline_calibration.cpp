@@ -98,7 +98,14 @@ Result<Gathered> gather(const OfflineCalibrationOptions& options, const Work& wo
   // Without patterns on the board nothing is known of the projector: it is not asked for.
   if (!projector_seen) std::erase_if(input.devices, [](const auto& device) { return device.projector; });
   if (options.keep_unseen)
-    std::erase_if(input.devices, [&](const CalibrationDevice& device) { return may_stay_unseen(device, input); });
+    for (auto device = input.devices.begin(); device != input.devices.end();) {
+      if (!may_stay_unseen(*device, input)) {
+        ++device;
+        continue;
+      }
+      std::erase_if(input.views, [&](const BoardView& view) { return view.camera == device->id; });
+      device = input.devices.erase(device);
+    }
   return gathered;
 }
 

@@ -80,11 +80,6 @@ TEST_F(Methods, ShutdownIsAnsweredAndAskedForOnce) {
   EXPECT_EQ(shutdowns_, 1);
 }
 
-TEST_F(Methods, WhatIsNotOfferedYetSaysSo) {
-  for (const char* method : {"calibration.capture", "calibration.solve", "calibration.apply", "calibration.discard"})
-    EXPECT_EQ(refusal(method), "unsupported") << method;
-}
-
 TEST_F(Methods, TheirParametersAreChecked) {
   EXPECT_EQ(refusal("preview.start", {{"camera", "nobody"}}), "not_found");
   EXPECT_EQ(refusal("preview.stop", {{"camera", "nobody"}}), "not_found");
