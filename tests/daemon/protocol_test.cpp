@@ -74,7 +74,7 @@ TEST_F(Protocol, WantsAnObjectOfKnownParameters) {
 
 TEST_F(Protocol, EveryMethodRefusesAnUnknownParameter) {
   const Json methods = call("system.describe")["methods"];
-  EXPECT_THAT(methods, SizeIs(24));
+  EXPECT_THAT(methods, SizeIs(26));
   for (const Json& method : methods) {
     EXPECT_EQ(refusal(method, {{"no_such_parameter", 1}}), "invalid_params") << method;
   }
