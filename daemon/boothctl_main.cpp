@@ -11,7 +11,6 @@
 #include <fstream>
 #include <iostream>
 #include <nlohmann/json.hpp>
-#include <numbers>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -20,15 +19,13 @@
 #include "config/booth_config.h"
 #include "daemon/api/client.h"
 #include "daemon/api/requests.h"
+#include "daemon/boothctl/calibrate.h"
 #include "daemon/boothctl/command.h"
-#include "daemon/boothctl/correct.h"
 #include "daemon/boothctl/doctor.h"
 #include "daemon/boothctl/keys.h"
 #include "daemon/identifier.h"
-#include "daemon/offline_calibration.h"
 #include "pipeline/calibration/board_pdf.h"
 #include "pipeline/export/sha256.h"
-#include "pipeline/thread_pool.h"
 #include "pipeline/types/rig.h"
 #include "replay/durable_folder.h"
 
@@ -42,13 +39,6 @@ using SteadyClock = std::chrono::steady_clock;
 constexpr const char* exit_codes =
     "Exit status: 0 done; 1 the booth refused or it failed; 2 wrong usage; 3 the booth cannot be reached, or does not "
     "answer in time.";
-
-/// What a terminal should not be made to interpret is shown as '?'.
-std::string printable(std::string text) {
-  for (char& c : text)
-    if (static_cast<unsigned char>(c) < 0x20 || c == 0x7f) c = '?';
-  return text;
-}
 
 std::string text_of(const Json& value) {
   if (value.is_string()) return printable(value.get<std::string>());
@@ -137,6 +127,7 @@ class Operator {
   void watch();
   void task(const std::string& method, const Json& params);
   void preview(const std::string& camera, int max_width, const fs::path& file);
+  api::Client& client() { return client_; }
 
  private:
   api::CallReply call(const std::string& method, const Json& params);
@@ -443,20 +434,6 @@ void write_board(const BoardOptions& options) {
             << board.dictionary << "\" }\n";
 }
 
-void calibrate_offline(const OfflineCalibrationOptions& options) {
-  ThreadPool pool;
-  const auto solved = calibrate_recordings(options, pool.work());
-  if (!solved) throw Failure{exit_refused, solved.error().message};
-  for (const DeviceQuality& device : solved->devices)
-    if (device.solved)
-      std::printf("%-12s %.3f px, %d views, position within %.2f mm, direction within %.4f deg\n", device.id.c_str(),
-                  device.rms_px, device.views, 1000 * device.pose.center_m,
-                  device.pose.rotation_rad * 180 / std::numbers::pi);
-  std::fflush(stdout);
-  for (const std::string& message : solved->messages) std::cout << "note: " << printable(message) << "\n";
-  std::cout << to_string(solved->verdict) << ": " << printable(solved->reason) << "\n";
-}
-
 }  // namespace
 }  // namespace booth
 
@@ -575,27 +552,8 @@ int main(int argc, char** argv) {
       ->check(CLI::Range(1.0, 1000.0));
   board->add_option("--dictionary", board_options.dictionary, "of the markers; DICT_5X5_250 when left out");
   board->callback([&] { offline = [&] { booth::write_board(board_options); }; });
-  booth::OfflineCalibrationOptions calibration;
-  auto* calibrate = app.add_subcommand("calibrate", "solve the rig from recordings of a board");
-  auto* boards =
-      calibrate->add_option("--recording", calibration.recordings, "a recording with a board shot; may be repeated");
-  const booth::CorrectCommand correct(*calibrate);
-  correct.option()->excludes(boards);
-  calibrate->add_option("--out", calibration.out, "the folder to make: rig.json, report.html, calibration.json")
-      ->required();
-  calibrate->add_option("--floor", calibration.floor_index,
-                        "index in the first board shot at which the board lies on the floor; otherwise the rig stays "
-                        "where the recording's lies");
-  calibrate->add_flag("--keep-unseen", calibration.keep_unseen,
-                      "cameras that never saw the board keep the recording's calibration");
-  calibrate->callback([&] {
-    if (!correct.wanted() && calibration.recordings.empty()) throw CLI::RequiredError("--recording or --correct");
-    offline = [&] {
-      if (!correct.wanted()) return booth::calibrate_offline(calibration);
-      if (const auto done = correct.run(calibration.out); !done)
-        throw booth::Failure{booth::exit_refused, done.error().message};
-    };
-  });
+  std::function<void(booth::api::Client&)> online;  // of one that speaks with the booth itself
+  booth::add_calibrate_command(app, options.json, offline, online);
   booth::add_doctor_command(app, options.json, offline);
   booth::add_keys_command(app, options.json, offline);
   auto* projector = app.add_subcommand("projector", "what lights the face with patterns");
@@ -622,7 +580,10 @@ int main(int argc, char** argv) {
       return booth::exit_ok;
     }
     booth::Operator op(options);
-    action(op);
+    if (online)
+      online(op.client());
+    else
+      action(op);
     return booth::exit_ok;
   } catch (const booth::Failure& failure) {
     std::cerr << "boothctl: " << failure.message << "\n";

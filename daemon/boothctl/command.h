@@ -16,4 +16,11 @@ struct Failure {
   std::string message;
 };
 
+/// What a terminal should not be made to interpret is shown as '?'.
+inline std::string printable(std::string text) {
+  for (char& c : text)
+    if (static_cast<unsigned char>(c) < 0x20 || c == 0x7f) c = '?';
+  return text;
+}
+
 }  // namespace booth
