@@ -3,14 +3,13 @@
 #include <gmock/gmock.h>
 
 #include <algorithm>
-#include <map>
 #include <numbers>
 
 #include "pipeline/calibration/world_frame.h"
 #include "pipeline/image/codec.h"
 #include "replay/durable_folder.h"
+#include "tests/daemon/board_recordings.h"
 #include "tests/daemon/test_booth.h"
-#include "tests/synthetic/board_recording.h"
 
 namespace booth::test {
 namespace {
@@ -20,63 +19,6 @@ using testing::HasSubstr;
 using testing::IsEmpty;
 using testing::Not;
 using testing::SizeIs;
-
-constexpr int tilted = 6;  ///< places of the board, the one on the floor aside
-
-/// The recordings that the tests play, each rendered once.
-class Recordings {
- public:
-  static Recordings& get() {
-    static Recordings recordings;
-    return recordings;
-  }
-  /// Boards tilted, then one on the floor.
-  fs::path good() {
-    auto options = usual();
-    options.places.push_back(synthetic::place_on_floor(options.board));
-    return made("good", options);
-  }
-  fs::path coplanar() {
-    auto options = usual();
-    options.places = synthetic::coplanar_places(options.board, 4);
-    return made("coplanar", options);
-  }
-  fs::path blind() {
-    auto options = usual();
-    options.blind = {"b3"};
-    return made("blind", options);
-  }
-  fs::path blurred() {
-    auto options = usual();
-    options.places.resize(3);
-    // So near that the markers can be read all the same.
-    for (Eigen::Isometry3d& place : options.places) place = Eigen::Translation3d(0, 0.4, 0.7) * place;
-    options.blur_px = 2.8;
-    return made("blurred", options);
-  }
-  fs::path enlarged() {
-    auto options = usual();
-    options.told.square_m *= 1.1;
-    options.told.marker_m *= 1.1;
-    return made("enlarged", options);
-  }
-
- private:
-  static synthetic::BoardRecordingOptions usual() {
-    synthetic::BoardRecordingOptions options;
-    options.rig = synthetic::arc_rig();
-    options.board = options.told = synthetic::small_board();
-    options.places = synthetic::tilted_places(options.board, tilted);
-    return options;
-  }
-  fs::path made(const std::string& name, const synthetic::BoardRecordingOptions& options) {
-    if (!made_.contains(name)) made_[name] = synthetic::write_board_recording(folder_.path(), name, options);
-    return made_[name];
-  }
-
-  const ScratchFolder folder_;
-  std::map<std::string, fs::path> made_;
-};
 
 class CalibrationMethods : public TestBooth {
  protected:
@@ -120,7 +62,7 @@ class CalibrationMethods : public TestBooth {
 double degrees(double radians) { return radians * 180 / std::numbers::pi; }
 
 TEST_F(CalibrationMethods, FromShotsToARigInForce) {
-  play(Recordings::get().good());
+  play(BoardRecordings::get().good());
   EXPECT_TRUE(calibration()["session"].is_null());
   const std::string task = call("calibration.capture")["task"];
   const auto entered = listener_->find(
@@ -202,7 +144,7 @@ TEST_F(CalibrationMethods, FromShotsToARigInForce) {
 }
 
 TEST_F(CalibrationMethods, AnEarlierRigComesBackAndNoneIsLost) {
-  play(Recordings::get().good());
+  play(BoardRecordings::get().good());
   EXPECT_EQ(refusal("calibration.restore"), "not_found");
   take_shots(tilted);
   ASSERT_EQ(solve()["state"], "done");
@@ -223,7 +165,7 @@ TEST_F(CalibrationMethods, AnEarlierRigComesBackAndNoneIsLost) {
 }
 
 TEST_F(CalibrationMethods, GoOnAfterARestart) {
-  play(Recordings::get().good());
+  play(BoardRecordings::get().good());
   take_shots(tilted);
   restart();
   EXPECT_EQ(calibration()["session"]["shots"], tilted);
@@ -240,7 +182,7 @@ TEST_F(CalibrationMethods, GoOnAfterARestart) {
 }
 
 TEST_F(CalibrationMethods, AreRefusedAtTheWrongMoment) {
-  play(Recordings::get().good());
+  play(BoardRecordings::get().good());
   EXPECT_EQ(refusal("calibration.solve"), "invalid_state") << "no shots";
   EXPECT_EQ(refusal("calibration.apply"), "invalid_state");
   EXPECT_EQ(call("calibration.discard"), Json::object()) << "there is nothing to discard";
@@ -269,7 +211,7 @@ TEST_F(CalibrationMethods, AreRefusedAtTheWrongMoment) {
 }
 
 TEST_F(CalibrationMethods, DiscardMayKeepTheShots) {
-  play(Recordings::get().good());
+  play(BoardRecordings::get().good());
   take_shots(tilted);
   ASSERT_EQ(solve()["state"], "done");
   call("calibration.discard", {{"shots", false}});
@@ -278,7 +220,7 @@ TEST_F(CalibrationMethods, DiscardMayKeepTheShots) {
 }
 
 TEST_F(CalibrationMethods, OfOnePlaceSaySo) {
-  play(Recordings::get().good());
+  play(BoardRecordings::get().good());
   take_shots(1);
   const Json end = solve();
   EXPECT_EQ(end["state"], "failed");
@@ -287,7 +229,7 @@ TEST_F(CalibrationMethods, OfOnePlaceSaySo) {
 }
 
 TEST_F(CalibrationMethods, OfBoardsInOnePlaneSaySo) {
-  play(Recordings::get().coplanar());
+  play(BoardRecordings::get().coplanar());
   take_shots(4);
   const Json end = solve();
   EXPECT_EQ(end["state"], "failed");
@@ -295,7 +237,7 @@ TEST_F(CalibrationMethods, OfBoardsInOnePlaneSaySo) {
 }
 
 TEST_F(CalibrationMethods, NameACameraThatNeverSawTheBoard) {
-  play(Recordings::get().blind());
+  play(BoardRecordings::get().blind());
   take_shots(tilted);
   const Json kept_camera = solve();
   ASSERT_EQ(kept_camera["state"], "done") << kept_camera;
@@ -315,7 +257,7 @@ TEST_F(CalibrationMethods, NameACameraThatNeverSawTheBoard) {
 }
 
 TEST_F(CalibrationMethods, CompareTheSquaresWithTheRigBefore) {
-  play(Recordings::get().enlarged());
+  play(BoardRecordings::get().enlarged());
   take_shots(tilted);
   const Json end = solve();
   ASSERT_EQ(end["state"], "done") << end;
@@ -324,7 +266,7 @@ TEST_F(CalibrationMethods, CompareTheSquaresWithTheRigBefore) {
 }
 
 TEST_F(CalibrationMethods, SayThatTheBoardWasBlurred) {
-  play(Recordings::get().blurred());
+  play(BoardRecordings::get().blurred());
   const Json shot = take()["result"];
   EXPECT_TRUE(std::any_of(shot["cameras"].begin(), shot["cameras"].end(), [](const Json& camera) {
     return camera["blurred"] == true;
@@ -340,7 +282,7 @@ TEST_F(CalibrationMethods, SurviveTheDeathOfTheirProcess) {
   std::ofstream(dies) << "#!/bin/sh\nkill -SEGV $$\n";
   fs::permissions(dies, fs::perms::owner_all);
   options_.calibrate_command = dies;
-  play(Recordings::get().good());
+  play(BoardRecordings::get().good());
   const Json shot = take();
   EXPECT_EQ(shot["state"], "failed");
   EXPECT_EQ(shot["error"]["kind"], "internal");
