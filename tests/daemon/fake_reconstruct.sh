@@ -20,12 +20,14 @@ case $(cat "$here/behaviour") in
     say '{"stage": "export", "fraction": 0.5}'
     publish
     ;;
-  good_health | moved | dark)
+  good_health | moved | shifted | dark)
     for camera in b0 b1 b2 b3; do
-      moved=false light=1.02
+      moved=false shifted=false light=1.02
       [ "$(cat "$here/behaviour")$camera" = movedb2 ] && moved=true
+      [ "$(cat "$here/behaviour")$camera" = shiftedb1 ] && shifted=true
       [ "$(cat "$here/behaviour")" = dark ] && light=1.9
-      say "{\"health\": {\"camera\": \"$camera\", \"moved\": $moved, \"offset_px\": 3.14, \"light_factor\": $light}}"
+      say "{\"health\": {\"camera\": \"$camera\", \"moved\": $moved, \"offset_px\": 3.14, \"shifted\": $shifted, \
+\"background_px\": 0.62, \"light_factor\": $light}}"
     done
     say '{"health": null}'
     publish

@@ -86,6 +86,15 @@ TEST_F(Health, ACameraThatWasMovedIsNamedWithinItsCapture) {
   EXPECT_THAT(call("system.status")["calibration"]["moved"], IsEmpty());
 }
 
+TEST_F(Health, ACameraWhoseBackgroundShiftedIsNamedToo) {
+  begin();
+  reconstruct_.behave("shifted");
+  capture_and_publish();
+  EXPECT_THAT(alerts("calibration_drift"),
+              testing::ElementsAre(AllOf(HasSubstr("camera b1 "), HasSubstr("0.62 pixels"), HasSubstr("--correct"))));
+  EXPECT_EQ(call("system.status")["calibration"]["moved"], Json({"b1"}));
+}
+
 TEST_F(Health, AnotherLightIsNoticedAndTheEmptyBoothLearnedAnew) {
   begin();
   reconstruct_.behave("dark");
