@@ -30,7 +30,9 @@ void HealthMonitor::report(const std::string& capture, const std::vector<CameraH
   {
     const std::lock_guard lock(mutex_);
     cameras_ = cameras;
-    for (const CameraHealth& camera : cameras)
+    if (older_background_)
+      for (CameraHealth& camera : cameras_) camera.shifted = false;
+    for (const CameraHealth& camera : cameras_)
       if (camera.moved || camera.shifted)
         alerts.push_back(
             {Severity::warning, "calibration_drift", drift_message(camera) + " (capture " + capture + ")"});
@@ -70,6 +72,7 @@ std::vector<std::string> HealthMonitor::moved() const {
 void HealthMonitor::calibrated() {
   const std::lock_guard lock(mutex_);
   displaced_.clear();
+  older_background_ = true;
   for (CameraHealth& camera : cameras_) {
     camera.moved = camera.shifted = false;
     camera.offset_px = camera.deviation = 0;
@@ -78,6 +81,7 @@ void HealthMonitor::calibrated() {
 
 void HealthMonitor::background_learned() {
   const std::lock_guard lock(mutex_);
+  older_background_ = false;
   light_.reset();
   asked_ = false;
   for (CameraHealth& camera : cameras_) {

@@ -29,7 +29,8 @@ class HealthMonitor {
   /// when the background is learned anew, until the booth is calibrated.
   std::vector<std::string> moved() const;
 
-  /// The calibration is another one now: nothing is known against it.
+  /// The calibration is another one now: nothing is known against it. Until the background is learned again, what has
+  /// shifted against it may have done so before, and tells nothing.
   void calibrated();
   /// The background was learned anew.
   void background_learned();
@@ -47,6 +48,7 @@ class HealthMonitor {
   mutable std::mutex mutex_;
   std::vector<CameraHealth> cameras_;  ///< guarded by mutex_
   std::set<std::string> displaced_;    ///< guarded by mutex_; shifted against a background before the present one
+  bool older_background_ = false;      ///< guarded by mutex_; than the calibration
   std::optional<std::string> light_;   ///< guarded by mutex_; a sentence: how the light has changed
   bool asked_ = false;                 ///< guarded by mutex_
 };

@@ -174,6 +174,19 @@ TEST(HealthMonitor, AShiftedCameraStaysBlamedWhenTheBackgroundIsLearnedAnew) {
   EXPECT_THAT(monitor.moved(), IsEmpty());
 }
 
+TEST(HealthMonitor, ABackgroundFromBeforeTheCalibrationBlamesNobody) {
+  EventBus events;
+  HealthMonitor monitor({}, events);
+  monitor.report("c", {{.camera = "a", .shifted = true, .background_px = 0.8}});
+  monitor.calibrated();
+  monitor.report("d", {{.camera = "a", .shifted = true, .background_px = 0.8}});
+  EXPECT_THAT(monitor.moved(), IsEmpty());
+  monitor.background_learned();
+  EXPECT_THAT(monitor.moved(), IsEmpty());
+  monitor.report("e", {{.camera = "a", .shifted = true, .background_px = 0.8}});
+  EXPECT_EQ(monitor.moved(), std::vector<std::string>{"a"});
+}
+
 TEST(HealthMonitor, ANewCalibrationStartsWithoutBlame) {
   EventBus events;
   HealthMonitor monitor({}, events);
