@@ -426,6 +426,13 @@ TEST_F(AravisSuite, RefusesWhatTheCameraCannotWithItsRange) {
   }
 }
 
+TEST_F(AravisSuite, RefusesAFeatureThatTheCameraHasNot) {
+  add_camera({.lacks = "Gamma"});
+  settings.cameras[0].response = AravisResponse::srgb;
+  EXPECT_EQ(refusal().message, "camera cam-0: response: srgb, but the camera has no Gamma");
+  EXPECT_EQ(refusal().code, ErrorCode::unsupported);
+}
+
 TEST_F(AravisSuite, RefusesPtpOfACameraWithout) {
   add_camera({.offers_ptp = false});
   settings.cameras[0].ptp = true;

@@ -205,6 +205,21 @@ TEST_F(V4l2, SetsEverythingByHandAndVerifiesIt) {
   EXPECT_EQ(camera->wait_frame(soon())->exposure_us, 8000);
 }
 
+TEST_F(V4l2, FocusIsSetByHand) {
+  auto focusing = usual_camera();
+  focusing.controls.push_back({V4L2_CID_FOCUS_AUTO, "Focus, Automatic", V4L2_CTRL_TYPE_BOOLEAN, 0, 1, 1, 1});
+  focusing.controls.push_back(
+      {V4L2_CID_FOCUS_ABSOLUTE, "Focus, Absolute", V4L2_CTRL_TYPE_INTEGER, 0, 250, 5, 0, {}, V4L2_CID_FOCUS_AUTO, 0});
+  system->plug_in(focusing);
+  auto focused = settings();
+  focused.focus = 120;
+  ASSERT_TRUE(open(focused));
+  EXPECT_EQ(system->control_value(node, V4L2_CID_FOCUS_AUTO), 0);
+  EXPECT_EQ(system->control_value(node, V4L2_CID_FOCUS_ABSOLUTE), 120);
+  focused.focus = 122;
+  EXPECT_EQ(refusal(focused), "body-00: focus is 122, this camera takes 0 … 250 in steps of 5");
+}
+
 TEST_F(V4l2, NamedControlsMayFreeOneAnother) {
   auto named = settings();
   named.controls = {{"exposure_time_absolute", 30}, {"auto_exposure", 1}};

@@ -364,7 +364,9 @@ class GigeCamera::Device {
     std::ifstream file(BOOTH_SOURCE_DIR "/tests/virtual_booth/gige/camera.xml", std::ios::binary);
     std::stringstream xml;
     xml << file.rdbuf();
-    const std::string text = xml.str();
+    std::string text = xml.str();
+    if (const size_t feature = text.find("Name=\"" + options_.lacks + "\""); feature != std::string::npos)
+      text.replace(feature, sizeof "Name=\"" - 1, "Name=\"Not");
     if (text.empty() || description + text.size() > memory_size) throw std::runtime_error("camera.xml cannot be read");
     write_text(description, text, text.size() + 1);
     std::stringstream url;

@@ -29,6 +29,7 @@ struct GigeCameraOptions {
   double clock_error_ppm = 0;               ///< how much faster than this machine's it runs
   bool shares_clock = false;                ///< it shows this machine's time, as all cameras that follow one PTP master
   bool offers_ptp = true;
+  std::string lacks = {};  ///< a feature of the description that it has not
   double largest_exposure_us = 1'000'000;
 };
 
