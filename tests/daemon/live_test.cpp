@@ -111,6 +111,8 @@ class Live : public TestBooth {
     };
   }
 
+  fs::path write_onlooker() const;
+
   std::vector<std::string> configured_ = all_cameras;
   std::optional<Rig> rig_;
   std::shared_ptr<FakeDevices> fake_;
@@ -681,6 +683,63 @@ TEST_F(OnTime, WhatAShotHasIsClearWithin500Milliseconds) {
   EXPECT_EQ(shot["missing"], Json({"b0", "b1"}));
   EXPECT_LE(shot["decided_ms"], 500);
   EXPECT_GE(shot["decided_ms"], 400) << "both triggers had their time";
+}
+
+/// A program in place of booth-calibrate that has looked as soon as it is asked: these pictures are too small for any
+/// board.
+fs::path Live::write_onlooker() const {
+  const fs::path program = folder_.path() / "onlooker";
+  std::ofstream(program) << "#!/bin/sh\necho '{\"shots\": 1}' > \"$2/look.json\"\n";
+  fs::permissions(program, fs::perms::owner_all);
+  return program;
+}
+
+TEST_F(Live, AShotOfTheBoardHasTheProjectedPatternsToo) {
+  options_.calibrate_command = write_onlooker();
+  begin();
+  const SeenEvent end = end_of_task(call("calibration.capture", {{"patterns", true}, {"floor", true}})["task"]);
+  ASSERT_EQ(end.fields["state"], "done") << end.fields;
+  EXPECT_EQ(end.fields["result"]["shots"], 1);
+  EXPECT_THAT(fake_->shown(), ElementsAre(0, 1, 2, 3, 4, 5, 6, 7, -1));
+  const auto shot = read_recording(options_.config.booth.rig().parent_path() / "session" / "shots" / "001");
+  ASSERT_TRUE(shot) << shot.error().message;
+  const Shot* board = shot->find(ShotRole::calibration_board);
+  const Shot* lit = shot->find(ShotRole::gray_code);
+  ASSERT_TRUE(board != nullptr && lit != nullptr);
+  EXPECT_EQ(board->name, "floor");
+  EXPECT_THAT(board->frames, SizeIs(all_cameras.size()));
+  EXPECT_EQ(lit->name, "board-0") << "of the board as it lies in the first picture";
+  EXPECT_THAT(lit->frames, SizeIs(2 * patterns)) << "of the face cameras";
+}
+
+TEST_F(Live, AShotOfTheBoardThatNobodyDeliversNamesTheCameras) {
+  options_.calibrate_command = write_onlooker();
+  begin();
+  fake_->play([](const std::string&, ShotRole role, int) {
+    return FakeAnswer{.kind = role == ShotRole::calibration_board ? Kind::nothing : Kind::frame};
+  });
+  const SeenEvent end = end_of_task(call("calibration.capture")["task"]);
+  EXPECT_EQ(end.fields["state"], "failed");
+  EXPECT_EQ(end.fields["error"]["kind"], "camera_unavailable");
+  EXPECT_THAT(end.fields["error"]["message"].get<std::string>(), HasSubstr("b0, b1, b2, b3, f0, f1"));
+  EXPECT_TRUE(call("system.status")["calibration"]["session"].is_null());
+}
+
+TEST_F(Live, ABoothThatWasNeverCalibratedTakesShotsOfTheBoard) {
+  options_.calibrate_command = write_onlooker();
+  rig_.reset();
+  open();
+  listener_ = std::make_unique<Listener>(options_.config.api.events, booth_.get());
+  ASSERT_TRUE(wait_until([&] { return kinds() == std::vector<std::string>{"not_calibrated", "no_background"}; }));
+  const SeenEvent end = end_of_task(call("calibration.capture")["task"]);
+  ASSERT_EQ(end.fields["state"], "done") << end.fields;
+  const auto shot = read_recording(options_.config.booth.rig().parent_path() / "session" / "shots" / "001");
+  ASSERT_TRUE(shot) << shot.error().message;
+  ASSERT_THAT(shot->rig.cameras, SizeIs(all_cameras.size()));
+  for (const RigCamera& camera : shot->rig.cameras) {
+    EXPECT_EQ(camera.intrinsics.width, FakeDevices::width);
+    EXPECT_EQ(camera.role == CameraRole::face, camera.id[0] == 'f') << camera.id;
+  }
 }
 
 }  // namespace
