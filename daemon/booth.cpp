@@ -652,7 +652,7 @@ void Booth::drain() {
 }
 
 Pulse::TimePoint Booth::last_pulse() const {
-  Pulse::TimePoint last = std::min(house_pulse_.last(), runner_->last_pulse());
+  Pulse::TimePoint last = std::min({house_pulse_.last(), runner_->last_pulse(), disk_executor_.last_pulse()});
   if (session_ != nullptr) last = std::min(last, session_->last_pulse());
   return last;
 }

@@ -23,6 +23,7 @@
 #include "daemon/boothctl/command.h"
 #include "daemon/boothctl/doctor.h"
 #include "daemon/boothctl/keys.h"
+#include "daemon/boothctl/report.h"
 #include "daemon/identifier.h"
 #include "pipeline/calibration/board_pdf.h"
 #include "pipeline/export/sha256.h"
@@ -555,6 +556,13 @@ int main(int argc, char** argv) {
   std::function<void(booth::api::Client&)> online;  // of one that speaks with the booth itself
   booth::add_calibrate_command(app, options.json, offline, online);
   booth::add_doctor_command(app, options.json, offline);
+  const booth::Connect connect = [&options] {
+    return std::make_unique<booth::api::Client>(
+        options.control, options.events, std::chrono::milliseconds(static_cast<int64_t>(1000 * options.timeout_s)),
+        options.credentials());
+  };
+  booth::add_report_command(app, connect, offline);
+  booth::add_metrics_command(app, connect, options.json, offline);
   booth::add_keys_command(app, options.json, offline);
   auto* projector = app.add_subcommand("projector", "what lights the face with patterns");
   projector->require_subcommand(1);

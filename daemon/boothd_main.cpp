@@ -37,8 +37,9 @@ namespace fs = std::filesystem;
 constexpr int exit_failed = 1;
 constexpr int exit_config = 2;  ///< systemd does not try again, see the unit
 constexpr std::chrono::milliseconds tick{500};
-/// A thread that gave no sign of life for so long hangs: the watchdog is no longer fed.
-constexpr std::chrono::seconds longest_silence{30};
+/// A thread that gave no sign of life for so long hangs: the watchdog is no longer fed. Where systemd says after what
+/// time it bites, half of that.
+constexpr std::chrono::microseconds default_silence = std::chrono::seconds(30);
 
 struct Arguments {
   std::string config_file, reconstruct_command;
@@ -89,6 +90,9 @@ std::string summary_of(const BoothStatus& status) {
 
 /// Until a signal or a client ends it.
 void watch(const Booth& booth, const api::Server& server, const SignalDescriptor& signals, const Wakeup& shut_down) {
+  uint64_t watchdog_us = 0;
+  const auto longest_silence =
+      sd_watchdog_enabled(0, &watchdog_us) > 0 ? std::chrono::microseconds(watchdog_us / 2) : default_silence;
   std::string told;
   for (;;) {
     std::array<pollfd, 2> polled{pollfd{signals.get(), POLLIN, 0}, pollfd{shut_down.fd(), POLLIN, 0}};

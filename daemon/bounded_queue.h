@@ -39,6 +39,12 @@ class BoundedQueue {
     return item;
   }
 
+  /// Nothing comes any more.
+  bool finished() const {
+    const std::lock_guard lock(mutex_);
+    return closed_ && items_.empty();
+  }
+
   /// All that is there now.
   std::deque<T> take() {
     const std::lock_guard lock(mutex_);
@@ -56,7 +62,7 @@ class BoundedQueue {
 
  private:
   const size_t capacity_;
-  std::mutex mutex_;
+  mutable std::mutex mutex_;
   std::condition_variable ready_;
   std::deque<T> items_;  ///< guarded by mutex_
   bool closed_ = false;  ///< guarded by mutex_

@@ -19,8 +19,11 @@ SerialExecutor::~SerialExecutor() { tasks_.close(); }
 bool SerialExecutor::post(std::function<void()> task) { return tasks_.try_push(std::move(task)); }
 
 void SerialExecutor::run() {
-  // pop returns nothing only when the queue is closed: the wait itself has no end that matters.
-  while (const auto task = tasks_.pop(std::chrono::hours(24 * 365))) {
+  constexpr std::chrono::milliseconds between_pulses{500};
+  while (!tasks_.finished()) {
+    pulse_.beat();
+    const auto task = tasks_.pop(between_pulses);
+    if (!task) continue;
     try {
       (*task)();
     } catch (const std::exception& fault) {

@@ -5,6 +5,7 @@
 #include <thread>
 
 #include "daemon/bounded_queue.h"
+#include "daemon/pulse.h"
 
 namespace booth {
 
@@ -20,11 +21,15 @@ class SerialExecutor {
   /// @return false: too much is waiting, and the task was not taken
   bool post(std::function<void()> task);
 
+  /// A task that does not come back leaves it behind.
+  Pulse::TimePoint last_pulse() const { return pulse_.last(); }
+
  private:
   void run();
 
   const std::string name_;
   BoundedQueue<std::function<void()>> tasks_;
+  Pulse pulse_;
   std::jthread thread_;
 };
 

@@ -225,6 +225,45 @@ TEST_F(Process, KeysOpenTheBoothToOtherMachines) {
   wait_exit();
 }
 
+TEST_F(Process, TheReportHoldsNothingOfTheVisitors) {
+  start_boothd();
+  const std::string label = "Zoë Müller-Lüdenscheidt";
+  const std::string id = capture({{"face", "none"}, {"label", label}});
+  ASSERT_TRUE(wait_job(id, "done"));
+  reconstruct_.behave("fail");
+  const std::string failed = capture({{"face", "none"}, {"label", "Erwin Lindemann"}});
+  ASSERT_TRUE(wait_job(failed, "failed"));
+  // As if something had let a label slip into the log.
+  std::ofstream(folder_.path() / "log", std::ios::app) << "a line about " << label << "\n";
+  const fs::path report = folder_.path() / "report.tar.gz", unpacked = folder_.path() / "unpacked";
+  const auto said = boothctl({"report", "--to", report, "--config", config_, "--log", folder_.path() / "log"});
+  ASSERT_EQ(said.first, 0);
+  fs::create_directories(unpacked);
+  ASSERT_EQ(run({"/bin/tar", "-xzf", report, "-C", unpacked}).first, 0);
+  EXPECT_THAT(entries(unpacked), testing::UnorderedElementsAre("boothd.toml", "describe.json", "doctor.json", "log.txt",
+                                                               "metrics.json", "status.json", "versions.txt"));
+  for (const std::string& name : entries(unpacked)) {
+    std::ifstream file(unpacked / name);
+    const std::string text((std::istreambuf_iterator<char>(file)), {});
+    EXPECT_THAT(text, testing::Not(IsEmpty())) << name;
+    for (const std::string& private_text : {label, std::string("Lindemann"), id, failed})
+      EXPECT_THAT(text, testing::Not(testing::HasSubstr(private_text))) << name;
+  }
+  std::ifstream log(unpacked / "log.txt");
+  const std::string text((std::istreambuf_iterator<char>(log)), {});
+  EXPECT_THAT(text, testing::HasSubstr("capture-1"));
+
+  EXPECT_THAT(boothctl({"metrics", "--prometheus"}).second,
+              testing::HasSubstr("# TYPE booth_request_seconds histogram"));
+  ASSERT_EQ(boothctl({"shutdown"}).first, 0);
+  wait_exit();
+  EXPECT_EQ(run({BOOTHCTL, "--control", options_.config.api.control, "--timeout", "0.2", "report", "--to", report,
+                 "--config", config_, "--log", config_})
+                .first,
+            0)
+      << "also without the booth";
+}
+
 TEST_F(Process, RefusesABadConfiguration) {
   EXPECT_EQ(run({BOOTHD, "--config", config_, "--reconstruct", reconstruct_.path(), "--check"}).first, 0);
   std::ofstream(config_) << "[jobs]\nworkers = 0\n[disk]\nreserve = 1\n";
