@@ -13,6 +13,7 @@
 #include <ctime>
 #include <exception>
 #include <fstream>
+#include <future>
 #include <set>
 #include <system_error>
 #include <utility>
@@ -118,6 +119,9 @@ Booth::~Booth() {
   eraser_.reset();
   runner_.reset();
   session_.reset();
+  // What was asked of the desk and still waits for the disk comes first.
+  std::promise<void> carried_out;
+  if (disk_executor_.post([&carried_out] { carried_out.set_value(); })) carried_out.get_future().wait();
   calibration_desk_.reset();
   cameras_.reset();
   previews_.reset();
