@@ -16,8 +16,8 @@ namespace {
 constexpr int scan_lines = 96;
 /// Nearer to the image's border an outline may be that of the image.
 constexpr int border_px = 6;
-/// Rays are followed near the hull in steps of so many voxels, then in ever smaller ones down to this length.
-constexpr double step_voxels = 3;
+/// Rays are followed near the hull in steps of this length, then in ever smaller ones.
+constexpr double step_m = 0.012;
 constexpr double finest_step_m = 0.0002;
 /// Misses beyond this, and beyond this share of the image's shorter side, are no matter of calibration.
 constexpr double largest_miss_px = 5;
@@ -117,7 +117,6 @@ class Sampling {
       begin_m = std::max(begin_m, std::min(a, b));
       end_m = std::min(end_m, std::max(a, b));
     }
-    const double step_m = step_voxels * grid.voxel_m;
     double best = std::numeric_limits<double>::infinity(), best_m = 0;
     size_t severest = 0;
     const auto look = [&](double at_m) {

@@ -14,7 +14,7 @@
 namespace booth {
 
 struct VisualHullOptions {
-  double voxel_m = 0.004;  ///< distance of the samples, 0.001 … 0.05
+  double voxel_m = 0.005;  ///< distance of the samples, 0.001 … 0.05
   int min_views = 3;       ///< a point inside fewer cameras' images is outside the hull, 1 … the number of cameras
 };
 
