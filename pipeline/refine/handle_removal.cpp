@@ -286,6 +286,47 @@ class Growth {
   std::array<size_t, depths> taken_{};
 };
 
+/// Parts minus rings, plus cavities, of the inside as marching cubes joins it: samples that are neighbours along an
+/// axis hang together. Counted as in a complex whose cells are samples, and pairs, squares and cubes of samples.
+long euler_number(const Field& field) {
+  const auto bricks = field.bricks();
+  long number = 0;
+  constexpr int reach = side + 1;
+  std::array<uint8_t, static_cast<size_t>(reach) * reach * reach> solid{};  // a brick and its next samples
+  for (int z = 0; z < bricks[2]; ++z)
+    for (int y = 0; y < bricks[1]; ++y)
+      for (int x = 0; x < bricks[0]; ++x) {
+        if (field.brick(field.brick_index(x, y, z)) == Field::all_outside) continue;
+        bool all_solid = true;
+        for (int part = 0; part < 8; ++part) {
+          const int i0 = (part & 1) * side, j0 = (part >> 1 & 1) * side, k0 = (part >> 2) * side;
+          const std::array<int, 3> at{x + (part & 1), y + (part >> 1 & 1), z + (part >> 2)};
+          const bool exists = at[0] < bricks[0] && at[1] < bricks[1] && at[2] < bricks[2];
+          const int32_t block = exists ? field.brick(field.brick_index(at[0], at[1], at[2])) : Field::all_outside;
+          all_solid = all_solid && block == Field::all_inside;
+          for (int k = k0; k < std::min(k0 + side, reach); ++k)
+            for (int j = j0; j < std::min(j0 + side, reach); ++j)
+              for (int i = i0; i < std::min(i0 + side, reach); ++i)
+                solid[static_cast<size_t>((k * reach + j) * reach + i)] =
+                    block < 0 ? block == Field::all_inside
+                              : field.block(block)[((k - k0) * side + j - j0) * side + i - i0] < 0;
+        }
+        if (all_solid) continue;  // each of its samples adds 1 - 3 + 3 - 1
+        for (int k = 0; k < side; ++k)
+          for (int j = 0; j < side; ++j)
+            for (int i = 0; i < side; ++i) {
+              const uint8_t* s = &solid[static_cast<size_t>((k * reach + j) * reach + i)];
+              if (s[0] == 0) continue;
+              constexpr int up = reach, far = reach * reach;
+              const int xy = s[1] & s[up], xz = s[1] & s[far], yz = s[up] & s[far];
+              const int square_xy = xy & s[1 + up], square_xz = xz & s[1 + far], square_yz = yz & s[up + far];
+              number += 1 - (s[1] + s[up] + s[far]) + (square_xy + square_xz + square_yz) -
+                        (square_xy & square_xz & square_yz & s[1 + up + far]);
+            }
+      }
+  return number;
+}
+
 size_t flip_small_layers(Field& field, bool inside, double area_m2, const Work& work) {
   const auto parts = Growth(field, inside, work).run();
   const double sample_m2 = field.grid().voxel_m * field.grid().voxel_m;
@@ -310,7 +351,10 @@ size_t flip_small_layers(Field& field, bool inside, double area_m2, const Work& 
 RemovedHandles remove_small_handles(Field& field, const HandleRemovalOptions& options, const Work& work) {
   RemovedHandles removed;
   if (field.bricks()[0] == 0) return removed;
+  constexpr long without_handles = 1;
+  if (euler_number(field) == without_handles) return removed;
   removed.filled_samples = flip_small_layers(field, false, options.area_m2, work);
+  if (euler_number(field) == without_handles) return removed;
   removed.cut_samples = flip_small_layers(field, true, options.area_m2, work);
   return removed;
 }
