@@ -161,10 +161,9 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   if (!capture) return capture.error();
 
   const auto stage_progress = [&](std::string_view stage, double fraction) { clock.tell(stage, fraction); };
-  auto made = reconstruct(*capture, options, face_model, work, stage_progress, health);
+  auto made = reconstruct(*std::move(capture), options, face_model, work, stage_progress, health);
   if (!made) return made.error();
   append(&report.warnings, made->warnings);
-  *capture = {};  // the export needs the memory more than anybody needs the images
 
   AvatarMetadata metadata;
   metadata.id = target.filename().string();

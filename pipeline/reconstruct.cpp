@@ -65,23 +65,19 @@ std::vector<Frame> background_of(const std::string& camera, std::span<const Fram
   return frames;
 }
 
-bool is_raw(const FrameSet& set) {
-  return std::any_of(set.frames.begin(), set.frames.end(), [](const Frame& frame) { return frame.mosaic.has_value(); });
-}
-
-/// The capture with its raw frames developed. @error invalid_argument  as develop
-Result<CaptureFrames> develop_all(const CaptureFrames& capture, const Work& work) {
-  CaptureFrames developed = capture;
+/// Develops a capture's raw frames where they are. @error invalid_argument  as develop
+Result<void> develop_all(CaptureFrames& capture, const Work& work) {
   std::vector<Frame*> frames;
-  for (FrameSet& set : developed.background)
+  for (FrameSet& set : capture.background)
     for (Frame& frame : set.frames) frames.push_back(&frame);
-  for (Frame& frame : developed.body.frames) frames.push_back(&frame);
-  if (developed.face)
-    for (FrameSet& set : developed.face->sets)
+  for (Frame& frame : capture.body.frames) frames.push_back(&frame);
+  if (capture.face)
+    for (FrameSet& set : capture.face->sets)
       for (Frame& frame : set.frames) frames.push_back(&frame);
   std::vector<std::optional<Error>> faults(frames.size());
   work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end && !work.stopped(); ++i) {
+      if (!frames[i]->mosaic) continue;
       auto frame = develop(*frames[i]);
       if (frame)
         *frames[i] = *std::move(frame);
@@ -92,7 +88,7 @@ Result<CaptureFrames> develop_all(const CaptureFrames& capture, const Work& work
   if (work.stopped()) return Work::cancelled();
   for (const auto& fault : faults)
     if (fault) return *fault;
-  return developed;
+  return {};
 }
 
 /// What one frame shows.
@@ -342,19 +338,15 @@ const std::vector<std::string>& reconstruction_stages() {
   return stages;
 }
 
-Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options,
+Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOptions& options,
                                    const FaceModelSource& face_model, const Work& work, const StageProgress& progress,
                                    const HealthReport& health) {
-  if (is_raw(capture.body) || std::any_of(capture.background.begin(), capture.background.end(), is_raw) ||
-      (capture.face && std::any_of(capture.face->sets.begin(), capture.face->sets.end(), is_raw))) {
-    const auto developed = develop_all(capture, work);
-    return developed ? reconstruct(*developed, options, face_model, work, progress, health) : developed.error();
-  }
+  if (const auto developed = develop_all(capture, work); !developed) return developed.error();
   if (const auto checked = check(capture.rig); !checked) return checked.error();
   Reconstruction result;
   std::vector<std::string>& warnings = result.warnings;
   // The order in which cameras delivered is chance.
-  std::vector<Frame> frames = capture.body.frames;
+  std::vector<Frame> frames = std::move(capture.body.frames);
   std::sort(frames.begin(), frames.end(), [](const Frame& a, const Frame& b) { return a.camera < b.camera; });
 
   SegmentedViews views;
@@ -364,6 +356,7 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
     if (!segmented) return segmented.error();
     views = std::move(*segmented);
     warnings = std::move(views.warnings);
+    capture.background = {};
   }
 
   VisualHull hull;
@@ -388,6 +381,7 @@ Result<Reconstruction> reconstruct(const CaptureFrames& capture, const Reconstru
     const StageReport report("face", work, progress);
     face = make_face(capture, hull, frames, views.silhouettes, options, face_model, report.work(), &warnings);
     hull.views.clear();
+    capture.face.reset();
     if (work.stopped()) return Work::cancelled();
   }
 

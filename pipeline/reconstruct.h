@@ -95,6 +95,7 @@ using HealthReport = std::function<void(const std::vector<CameraHealth>& cameras
 
 /// The whole method: segment → hull → refine → face → surface → atlas → skeleton → skin.
 ///
+/// @param capture     each part of it is freed as soon as no stage needs it any more
 /// @param face_model  for the passive face; left out, there is none
 /// @param work        its progress is not used; stages report through `progress`
 /// A camera that cannot be used is left out with a warning; a shape that cannot be rigged comes back without joints
@@ -102,7 +103,7 @@ using HealthReport = std::function<void(const std::vector<CameraHealth>& cameras
 /// warning.
 ///
 /// @error what the stages return, cancelled
-Result<Reconstruction> reconstruct(const CaptureFrames& capture, const ReconstructionOptions& options,
+Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOptions& options,
                                    const FaceModelSource& face_model = {}, const Work& work = {},
                                    const StageProgress& progress = {}, const HealthReport& health = {});
 

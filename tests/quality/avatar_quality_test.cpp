@@ -36,7 +36,7 @@ Result<Reconstruction> reconstruct_with_defaults(const Recording& recording) {
   capture.rig = recording.rig;
   capture.background = load_shot(recording, *recording.find(ShotRole::background), work).sets;
   capture.body = load_shot(recording, *recording.find(ShotRole::body), work).sets.at(0);
-  return reconstruct(capture, {}, {}, work);
+  return reconstruct(std::move(capture), {}, {}, work);
 }
 
 CalibratedView view_of(const nlohmann::json& json) {
