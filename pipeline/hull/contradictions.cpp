@@ -18,6 +18,10 @@ constexpr int largest_block = 16;
 constexpr int smallest_block = 4;
 /// Others must agree by this much: more than an outline is off by calibration and segmentation.
 constexpr float agreed_m = 0.012F;
+/// What hangs together with a missing part and is thinner, such as fingers with a hand: others agree by this much, and
+/// it lies at most so many points away.
+constexpr float faintly_agreed_m = 0.002F;
+constexpr int faint_steps = 12;
 /// Deeper in the hull of all others no true gap lies, such as between arm and trunk, that one camera alone sees
 /// through. Measured on standing people: up to 40 mm with ten cameras around, 45 mm with eight.
 constexpr float deep_m = 0.06F;
@@ -37,15 +41,28 @@ constexpr int looks_across = 60;  ///< pixels along an image's shorter side that
 struct Denied {
   std::array<int, 3> place;
   uint32_t view;
+  bool agreed;        ///< others agree by more than outlines are off
   bool deep;          ///< inside the hull of all others
   bool proven;        ///< a ray of another camera through it misses the hull
   bool hole = false;  ///< deep, and its camera sees through a gap in the middle of the subject
 };
 
+/// How far a line runs on before it leaves the brick of the sample nearest to `at`; both in samples.
+double rest_in_brick(const Eigen::Vector3d& at, const Eigen::Vector3d& direction) {
+  double rest = std::numeric_limits<double>::infinity();
+  for (int axis = 0; axis < 3; ++axis) {
+    const double in_brick = at[axis] + 0.5 - Field::brick_side * std::floor((at[axis] + 0.5) / Field::brick_side);
+    if (direction[axis] > 0) rest = std::min(rest, (Field::brick_side - in_brick) / direction[axis]);
+    if (direction[axis] < 0) rest = std::min(rest, -in_brick / direction[axis]);
+  }
+  return rest;
+}
+
 /// Whether a line through a point meets the hull, in steps of a sample; it passes the nearest sample by less than a
 /// voxel.
 bool meets(const Field& hull, const Eigen::Vector3d& p, const Eigen::Vector3d& direction) {
   const Grid& grid = hull.grid();
+  constexpr int side = Field::brick_side;
   for (const double way : {1.0, -1.0}) {
     const Eigen::Vector3d step = way * direction;
     Eigen::Vector3d at = (p - grid.origin) / grid.voxel_m;
@@ -53,7 +70,12 @@ bool meets(const Field& hull, const Eigen::Vector3d& p, const Eigen::Vector3d& d
       const auto i = static_cast<int>(std::lround(at.x())), j = static_cast<int>(std::lround(at.y()));
       const auto k = static_cast<int>(std::lround(at.z()));
       if (i < 0 || j < 0 || k < 0 || i >= grid.size[0] || j >= grid.size[1] || k >= grid.size[2]) break;
-      if (static_cast<double>(hull.at(i, j, k)) < grid.voxel_m) return true;
+      const int32_t brick = hull.brick(hull.brick_index(i / side, j / side, k / side));
+      if (brick == Field::all_outside) {
+        at += (std::floor(rest_in_brick(at, step)) + 1) * step;
+        continue;
+      }
+      if (brick == Field::all_inside || static_cast<double>(hull.at(i, j, k)) < grid.voxel_m) return true;
       at += step;
     }
   }
@@ -133,9 +155,14 @@ class Search {
               least_agreed = std::max(least_agreed, distance);
             }
           }
-          if (deniers != 1 || witnesses < fewest_witnesses || least_agreed > -agreed_m) continue;
+          if (deniers != 1 || witnesses < fewest_witnesses || least_agreed > -faintly_agreed_m) continue;
+          const bool agreed = least_agreed <= -agreed_m;
           const bool deep = witnesses >= fewest_deep_witnesses && least_agreed < -deep_m;
-          found.push_back({.place = place, .view = order[0], .deep = deep, .proven = missed_by_a_ray(p, order[0])});
+          found.push_back({.place = place,
+                           .view = order[0],
+                           .agreed = agreed,
+                           .deep = deep,
+                           .proven = agreed && missed_by_a_ray(p, order[0])});
         }
   }
 
@@ -179,41 +206,74 @@ Image outer_background(const Image& coverage) {
   return outer;
 }
 
-/// Keeps the points of one view that hang together in parts of which enough is proven, or with a hole.
-std::vector<Denied> proven_parts(std::vector<Denied> points) {
-  const auto before = [](const Denied& a, const Denied& b) { return a.place < b.place; };
-  std::sort(points.begin(), points.end(), before);
+/// The points of one view in lexicographic order of their places, to walk from one to its neighbours.
+class Neighbourhood {
+ public:
+  explicit Neighbourhood(std::vector<Denied> points) : points_(std::move(points)) {
+    std::sort(points_.begin(), points_.end(), before);
+  }
+
+  const std::vector<Denied>& points() const { return points_; }
+
+  template <class Visitor>
+  void for_each_around(size_t n, const Visitor& visit) const {
+    const auto [x, y, z] = points_[n].place;
+    Denied next = points_[n];
+    for (int dx = -1; dx <= 1; ++dx)
+      for (int dy = -1; dy <= 1; ++dy) {
+        next.place = {x + dx, y + dy, z - 1};
+        const std::array<int, 3> last{x + dx, y + dy, z + 1};
+        for (auto at = std::lower_bound(points_.begin(), points_.end(), next, before);
+             at != points_.end() && at->place <= last; ++at)
+          visit(static_cast<size_t>(at - points_.begin()));
+      }
+  }
+
+ private:
+  static bool before(const Denied& a, const Denied& b) { return a.place < b.place; }
+
+  std::vector<Denied> points_;
+};
+
+/// Keeps the points of one view that hang together in parts of which enough is proven, or with a hole, and what hangs
+/// on these parts.
+std::vector<Denied> proven_parts(std::vector<Denied> of_view) {
+  const Neighbourhood around(std::move(of_view));
+  const std::vector<Denied>& points = around.points();
   std::vector<bool> reached(points.size());
-  std::vector<size_t> part;
-  const auto reach = [&](size_t n) {
-    if (reached[n]) return;
-    reached[n] = true;
-    part.push_back(n);
-  };
-  std::vector<Denied> kept;
+  std::vector<size_t> kept, part;
   for (size_t seed = 0; seed < points.size(); ++seed) {
-    part.clear();
-    reach(seed);
+    if (reached[seed] || !points[seed].agreed) continue;
+    part.assign(1, seed);
+    reached[seed] = true;
     size_t proven = 0;
     bool hole = false;
     for (size_t m = 0; m < part.size(); ++m) {
       if (points[part[m]].proven) ++proven;
       hole = hole || points[part[m]].hole;
-      const auto [x, y, z] = points[part[m]].place;
-      for (int dx = -1; dx <= 1; ++dx)
-        for (int dy = -1; dy <= 1; ++dy) {
-          Denied next = points[part[m]];
-          next.place = {x + dx, y + dy, z - 1};
-          for (auto n = std::lower_bound(points.begin(), points.end(), next, before);
-               n != points.end() && n->place <= std::array<int, 3>{x + dx, y + dy, z + 1}; ++n)
-            reach(static_cast<size_t>(n - points.begin()));
-        }
+      around.for_each_around(part[m], [&](size_t n) {
+        if (reached[n] || !points[n].agreed) return;
+        reached[n] = true;
+        part.push_back(n);
+      });
     }
     const auto share = static_cast<double>(proven) / static_cast<double>(part.size());
     if (hole || (proven >= least_proven_points && share >= least_proven_share))
-      for (const size_t n : part) kept.push_back(points[n]);
+      kept.insert(kept.end(), part.begin(), part.end());
   }
-  return kept;
+  size_t begin = 0;
+  for (int step = 0; step < faint_steps; ++step) {
+    const size_t end = kept.size();
+    for (; begin < end; ++begin)
+      around.for_each_around(kept[begin], [&](size_t n) {
+        if (reached[n]) return;
+        reached[n] = true;
+        kept.push_back(n);
+      });
+  }
+  std::vector<Denied> denied;
+  for (const size_t n : kept) denied.push_back(points[n]);
+  return denied;
 }
 
 }  // namespace
