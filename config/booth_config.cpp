@@ -89,10 +89,18 @@ void visit_disk(Visitor& visitor, DiskConfig& disk) {
 }
 
 template <class Visitor>
+void visit_retention(Visitor& visitor, RetentionConfig& retention) {
+  visitor.integer("max_age_h", retention.max_age_h, 0, 1'000'000);
+  visitor.integer("max_captures", retention.max_captures, 0, 10'000'000);
+  visitor.boolean("make_room", retention.make_room);
+}
+
+template <class Visitor>
 void visit_jobs(Visitor& visitor, JobsConfig& jobs) {
   visitor.integer("workers", jobs.workers, 1, 64);
   visitor.integer("threads", jobs.threads, 0, 256);
   visitor.integer("timeout_s", jobs.timeout_s, 1, 86400);
+  visitor.integer("memory_mib", jobs.memory_mib, 0, 10'000'000);
   visitor.integer("retries", jobs.retries, 0, 10);
 }
 
@@ -388,6 +396,7 @@ void visit_config(Visitor& visitor, BoothConfig& config) {
   visitor.section("background", [&](auto& section) { visit_background(section, config.background); });
   visitor.section("calibration", [&](auto& section) { visit_calibration(section, config.calibration); });
   visitor.section("disk", [&](auto& section) { visit_disk(section, config.disk); });
+  visitor.section("retention", [&](auto& section) { visit_retention(section, config.retention); });
   visitor.section("jobs", [&](auto& section) { visit_jobs(section, config.jobs); });
   visitor.section("log", [&](auto& section) { visit_log(section, config.log); });
   std::vector<CameraConfig> one_of_each_driver(camera_drivers.size());

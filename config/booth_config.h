@@ -68,11 +68,19 @@ struct DiskConfig {
   int limit_mib = 0;       ///< most that the state directory may hold, 0 … 10^8; 0: no limit
 };
 
+/// What the booth deletes by itself, recording and avatar together, the oldest first; never what is not done yet.
+struct RetentionConfig {
+  int max_age_h = 0;       ///< what is older goes, 0 … 10^6; 0: nothing goes for its age
+  int max_captures = 0;    ///< when there are more, the oldest go, 0 … 10^7; 0: any number
+  bool make_room = false;  ///< the oldest go when a capture would find no room
+};
+
 struct JobsConfig {
   int workers = 1;      ///< reconstructions at the same time, 1 … 64
   int threads = 0;      ///< of one reconstruction, 0 … 256; 0: as many as there are processors
   int timeout_s = 300;  ///< after which a reconstruction is stopped and has failed, 1 … 86400
-  int retries = 1;      ///< of a reconstruction whose process died, 0 … 10
+  int memory_mib = 0;   ///< most that one reconstruction may take, 0 … 10^7; 0: three quarters of the machine's
+  int retries = 1;      ///< of a reconstruction whose process died, hung or took too much memory, 0 … 10
 };
 
 struct FaceConfig {
@@ -134,6 +142,7 @@ struct BoothConfig {
   BackgroundConfig background;
   CalibrationConfig calibration;
   DiskConfig disk;
+  RetentionConfig retention;
   JobsConfig jobs;
   LogConfig log;
   std::vector<CameraConfig> cameras;  ///< none: all that the recording of [replay] has

@@ -99,6 +99,7 @@ Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<D
                        .workers = config.jobs.workers,
                        .threads = config.jobs.threads,
                        .timeout = std::chrono::seconds(config.jobs.timeout_s),
+                       .most_bytes = static_cast<uint64_t>(config.jobs.memory_mib) * mebibyte,
                        .retries = config.jobs.retries},
       *booth->jobs_, *booth->avatars_, booth->events_, booth->metrics_,
       [self = booth.get()](const std::string& capture, const std::vector<CameraHealth>& cameras) {
@@ -269,26 +270,35 @@ std::shared_ptr<const Rig> Booth::rig() const {
 }
 
 /// The daemon may have died after a capture was on the disk and before its job was, or between the two deletions of an
-/// earlier program version: recordings without a job get one, jobs without a recording go.
+/// earlier program version, and a disk may fail to give what it has: recordings without a job get one, jobs without a
+/// recording go, done ones without an avatar are done again.
 void Booth::adopt_orphans() {
   const IdentityConfig& booth = options_.config.booth;
   std::error_code code;
   for (fs::directory_iterator entry(booth.recordings(), code), end; !code && entry != end; entry.increment(code)) {
     const std::string id = entry->path().filename().string();
-    if (!is_safe_id(id) || jobs_->find(id) || avatars_->find(id)) continue;
+    if (!is_safe_id(id) || jobs_->find(id)) continue;
     const auto recording = read_recording(entry->path());
     if (!recording) {
       spdlog::warn("{}: not a recording: {}", entry->path().string(), recording.error().message);
       continue;
     }
     spdlog::info("capture {}: had no job, it gets one", id);
-    jobs_->add(
-        {.id = id, .face = face_mode_from(recording->face) ? recording->face : "auto", .label = recording->label});
+    const bool done = avatars_->find(id).has_value();
+    jobs_->add({.id = id,
+                .face = face_mode_from(recording->face) ? recording->face : "auto",
+                .label = recording->label,
+                .state = done ? JobState::done : JobState::queued,
+                .fraction = done ? 1.0 : 0.0});
     if (const auto written = jobs_->persist(id); !written) spdlog::error("{}", written.error().message);
     jobs_->release(id);
   }
   for (const Job& job : jobs_->list()) {
-    if (fs::exists(booth.recordings() / job.id, code) || avatars_->find(job.id)) continue;
+    if (avatars_->find(job.id)) continue;
+    if (fs::exists(booth.recordings() / job.id, code)) {
+      jobs_->redo(job.id);
+      continue;
+    }
     spdlog::info("job {}: its recording is gone, and so it goes", job.id);
     jobs_->forget(job.id);
     if (const auto written = jobs_->persist(job.id); !written) spdlog::error("{}", written.error().message);

@@ -10,6 +10,8 @@
 #include <algorithm>
 #include <array>
 #include <cerrno>
+#include <fstream>
+#include <string>
 #include <system_error>
 #include <utility>
 
@@ -142,6 +144,13 @@ ChildProcess::~ChildProcess() {
 void ChildProcess::kill() noexcept {
   // A child that was waited for has given its number back.
   if (pid_ > 0 && !status_) ::kill(-pid_, SIGKILL);
+}
+
+uint64_t ChildProcess::resident_bytes() const {
+  std::ifstream file("/proc/" + std::to_string(pid_) + "/statm");
+  uint64_t pages = 0, resident_pages = 0;
+  if (!(file >> pages >> resident_pages)) return 0;
+  return resident_pages * static_cast<uint64_t>(::sysconf(_SC_PAGESIZE));
 }
 
 std::optional<int> ChildProcess::poll_status() {

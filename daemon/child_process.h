@@ -2,6 +2,7 @@
 
 #include <sys/types.h>
 
+#include <cstdint>
 #include <optional>
 #include <string>
 #include <vector>
@@ -29,6 +30,9 @@ class ChildProcess {
 
   /// SIGKILL to the whole group.
   void kill() noexcept;
+
+  /// Memory that it takes now, without what it may have started itself; 0 where that is not known.
+  uint64_t resident_bytes() const;
 
   /// How it ended, as waitpid says; nothing while it runs.
   std::optional<int> poll_status();

@@ -22,6 +22,7 @@ using Json = nlohmann::json;
 /// is there each time is.
 constexpr int most_interruptions = 10;
 constexpr size_t most_bytes = 64 * 1024;
+constexpr int file_version = 1;
 
 std::optional<JobState> job_state_from(const std::string& name) {
   for (const JobState state :
@@ -31,7 +32,8 @@ std::optional<JobState> job_state_from(const std::string& name) {
 }
 
 std::string write_job(const Job& job) {
-  Json json{{"id", job.id},
+  Json json{{"version", file_version},
+            {"id", job.id},
             {"face", job.face},
             {"label", job.label},
             {"state", to_string(job.state)},
@@ -41,22 +43,21 @@ std::string write_job(const Job& job) {
   return json.dump(2, ' ', false, Json::error_handler_t::replace) + "\n";
 }
 
-/// Nothing for what is not a job of that id.
+/// Nothing for what is not a job of that id. Only what every version has is asked for.
 std::optional<Job> parse_job(const std::vector<uint8_t>& bytes, const std::string& id) {
   try {
     const Json json = Json::parse(bytes);
     Job job;
     job.id = json.at("id").get<std::string>();
-    job.face = json.at("face").get<std::string>();
-    job.label = json.at("label").get<std::string>();
-    job.interrupted = json.at("interrupted").get<int>();
-    job.died = json.at("died").get<int>();
-    if (json.contains("error"))
-      job.error =
-          Reason{json.at("error").at("kind").get<std::string>(), json.at("error").at("message").get<std::string>()};
+    job.face = json.value("face", "auto");
+    job.label = json.value("label", "");
+    job.interrupted = json.value("interrupted", 0);
+    job.died = json.value("died", 0);
+    if (const auto error = json.find("error"); error != json.end() && error->is_object())
+      job.error = Reason{error->value("kind", "internal"), error->value("message", "it is not known why")};
     const auto state = job_state_from(json.at("state").get<std::string>());
-    if (!state || job.id != id || !is_safe_id(id)) return std::nullopt;
-    job.state = *state;
+    if (job.id != id || !is_safe_id(id)) return std::nullopt;
+    job.state = state.value_or(JobState::queued);  // one of a newer version: this one starts over
     job.fraction = job.state == JobState::done ? 1 : 0;
     return job;
   } catch (const Json::exception&) {
@@ -89,6 +90,10 @@ Result<std::unique_ptr<JobQueue>> JobQueue::open(const fs::path& folder, EventBu
     if (file->path().extension() != ".json") continue;
     const std::string id = file->path().stem().string();
     const auto bytes = read_file(file->path(), most_bytes);
+    if (!bytes && bytes.error().code == ErrorCode::io) {
+      spdlog::warn("{}", bytes.error().message);
+      continue;
+    }
     std::optional<Job> job;
     if (bytes) job = parse_job(*bytes, id);
     if (!job) {
@@ -132,6 +137,17 @@ std::optional<Job> JobQueue::find(const std::string& id) const {
 void JobQueue::add(const Job& job) {
   const std::lock_guard lock(mutex_);
   if (entries_.try_emplace(job.id, Entry{.job = job}).second) occupied_.insert(job.id);
+}
+
+void JobQueue::redo(const std::string& id) {
+  {
+    const std::lock_guard lock(mutex_);
+    const auto found = entries_.find(id);
+    if (found == entries_.end() || found->second.job.state != JobState::done) return;
+    Job& job = found->second.job;
+    job = Job{.id = job.id, .face = job.face, .label = job.label};
+  }
+  queued_.notify_one();
 }
 
 Result<void> JobQueue::retry(const std::string& id) {
@@ -182,9 +198,13 @@ Result<void> JobQueue::persist(const std::string& id) {
 std::optional<JobQueue::Lease> JobQueue::take(const std::stop_token& stop, std::chrono::milliseconds patience) {
   std::unique_lock lock(mutex_);
   const auto next = [this] {
-    return std::find_if(entries_.begin(), entries_.end(), [this](const auto& entry) {
-      return entry.second.job.state == JobState::queued && !occupied_.contains(entry.first);
-    });
+    auto found = entries_.end();
+    for (auto entry = entries_.begin(); entry != entries_.end(); ++entry) {
+      const Job& job = entry->second.job;
+      if (job.state != JobState::queued || occupied_.contains(entry->first)) continue;
+      if (found == entries_.end() || job.died < found->second.job.died) found = entry;
+    }
+    return found;
   };
   if (!queued_.wait_for(lock, stop, patience, [&] { return next() != entries_.end(); }) || stop.stop_requested())
     return std::nullopt;

@@ -30,18 +30,21 @@ struct Job {
   double fraction = 0;     ///< of the whole job
   std::optional<Reason> error = {};
   int interrupted = 0;  ///< how often the daemon died while it ran
-  int died = 0;         ///< how often its own process died
+  int died = 0;         ///< how often its own process died, hung, or took more memory than it may
 };
 
 /// The jobs, one file each, so that they survive the daemon. Changes take effect in memory at once and block
 /// nobody; persist() brings them to the disk. Any thread.
+///
+/// The files have a version. Those of older and of newer programs are read too: what is missing has its default, what
+/// is unknown is left out, so that a queue survives an upgrade and the way back.
 ///
 ///     queued → running → done | failed | cancelled → (retry) queued
 class JobQueue {
  public:
   /// Reads the jobs of `folder`, which is made where it is missing. One that was running goes on as queued, unless
   /// the daemon died too often while it ran: then it has failed, lest it bring the daemon down for ever. A file
-  /// that cannot be read is removed: the capture gets a new job.
+  /// that is no job is removed, one that the disk does not give is left: either way the capture gets a new job.
   /// @error io, disk_full
   static Result<std::unique_ptr<JobQueue>> open(const std::filesystem::path& folder, EventBus& events);
 
@@ -51,6 +54,8 @@ class JobQueue {
   /// A new job, queued. One that is already there is left alone. No worker takes it before release(id).
   void add(const Job& job);
   void release(const std::string& id);
+  /// What a done job made is gone: it is queued again. Other jobs are left alone.
+  void redo(const std::string& id);
   /// @error not_found; invalid_state  neither failed nor cancelled
   Result<void> retry(const std::string& id);
   /// The job is cancelled from now on; a worker that has it sees so by is_wanted.
@@ -67,8 +72,9 @@ class JobQueue {
     Job job;
     uint64_t number = 0;
   };
-  /// Waits for the oldest queued job and takes it, unless a worker still clears away an earlier run of it. Nothing:
-  /// `stop` was requested, or nothing came for `patience`. The worker ends with release().
+  /// Waits for the oldest queued job and takes it, unless a worker still clears away an earlier run of it. Jobs whose
+  /// process died before come after all others. Nothing: `stop` was requested, or nothing came for `patience`. The
+  /// worker ends with release().
   std::optional<Lease> take(const std::stop_token& stop, std::chrono::milliseconds patience);
   bool is_wanted(const Lease& lease) const;
   /// @param publish  whether listeners hear of it
@@ -76,7 +82,8 @@ class JobQueue {
   /// @return whether the lease was still good
   bool finish(const Lease& lease);
   bool fail(const Lease& lease, const Reason& error);
-  /// The job's process died. It is queued again unless that happened more than `retries` times: then it failed.
+  /// The job's process died, or had to be killed. It is queued again, behind the others, unless that happened more than
+  /// `retries` times: then it failed.
   bool died(const Lease& lease, int retries, const Reason& error);
   /// The job goes back into the queue, and this run does not count: the daemon is stopping.
   void give_back(const Lease& lease);

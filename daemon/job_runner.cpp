@@ -52,6 +52,10 @@ CameraHealth health_of(const Json& object) {
           .background_share = number_of(object, "background_share", 1)};
 }
 
+uint64_t three_quarters_of_memory() {
+  return static_cast<uint64_t>(::sysconf(_SC_PHYS_PAGES)) * static_cast<uint64_t>(::sysconf(_SC_PAGESIZE)) / 4 * 3;
+}
+
 std::string describe_end(int status, const std::string& last_words) {
   std::string text = WIFSIGNALED(status) ? "was killed by signal " + std::to_string(WTERMSIG(status))
                                          : "ended with status " + std::to_string(WEXITSTATUS(status));
@@ -63,7 +67,7 @@ std::string describe_end(int status, const std::string& last_words) {
 
 /// One run of a process, from its start to its end.
 struct JobRunner::Run {
-  enum class End { exited, timed_out, unwanted, stopped, not_started };
+  enum class End { exited, timed_out, too_large, unwanted, stopped, not_started };
   End end = End::not_started;
   int status = 0;               ///< of an exited one, as waitpid says
   std::optional<Reason> error;  ///< what it said itself, or why it could not be started
@@ -170,6 +174,7 @@ void JobRunner::run(const JobQueue::Lease& lease, const std::stop_token& stop, P
     };
 
     const auto deadline = started + options_.timeout;
+    const uint64_t most_bytes = options_.most_bytes > 0 ? options_.most_bytes : three_quarters_of_memory();
     bool progress_open = true, output_open = true;
     for (;;) {
       pulse.beat();
@@ -192,6 +197,8 @@ void JobRunner::run(const JobQueue::Lease& lease, const std::stop_token& stop, P
         run.end = Run::End::stopped;
       else if (SteadyClock::now() >= deadline)
         run.end = Run::End::timed_out;
+      else if (child->resident_bytes() > most_bytes)
+        run.end = Run::End::too_large;
       if (run.end != Run::End::not_started) break;
     }
   }  // the process is dead from here on
@@ -210,8 +217,13 @@ void JobRunner::conclude(const JobQueue::Lease& lease, const Run& run) {
   } else if (run.end == Run::End::exited) {
     jobs_.fail(lease, run.error ? *run.error : Reason{"internal", describe_end(run.status, run.output.last_line())});
   } else if (run.end == Run::End::timed_out) {
-    jobs_.fail(lease, {"timeout", "the reconstruction took longer than " +
-                                      std::to_string(options_.timeout.count() / 1000) + " s and was stopped"});
+    jobs_.died(lease, options_.retries,
+               {"timeout", "the reconstruction took longer than " + std::to_string(options_.timeout.count() / 1000) +
+                               " s and was stopped"});
+  } else if (run.end == Run::End::too_large) {
+    jobs_.died(
+        lease, options_.retries,
+        {"out_of_memory", "the reconstruction took more memory than it may and was stopped: see jobs.memory_mib"});
   } else if (run.end == Run::End::not_started) {
     jobs_.fail(lease, *run.error);
   } else if (run.end == Run::End::stopped) {
@@ -224,6 +236,10 @@ void JobRunner::conclude(const JobQueue::Lease& lease, const Run& run) {
 
   persist(id);
   const auto job = jobs_.find(id);
+  if (job && job->died > 0 && job->state != JobState::failed) {
+    metrics_.add("jobs_retried");
+    spdlog::warn("job {}: its process died, hung or took too much memory; it is tried again", id);
+  }
   if (!job || job->state != JobState::failed) return;
   metrics_.add("jobs_failed");
   spdlog::error("job {}: failed: {}: {}", id, job->error->kind, job->error->message);

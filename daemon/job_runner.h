@@ -2,6 +2,7 @@
 
 #include <atomic>
 #include <chrono>
+#include <cstdint>
 #include <filesystem>
 #include <functional>
 #include <string>
@@ -24,13 +25,15 @@ struct JobRunnerOptions {
   int workers = 1;
   int threads = 0;  ///< of one reconstruction; 0: as many as there are processors
   std::chrono::milliseconds timeout{300'000};
-  int retries = 1;  ///< of a job whose process died
+  uint64_t most_bytes = 0;  ///< of memory that one process may take; 0: three quarters of the machine's
+  int retries = 1;          ///< of a job whose process died, hung, or took too much memory
 };
 
 /// What a job's process found out about the booth's cameras. Called by workers, several at a time.
 using OnHealth = std::function<void(const std::string& capture, const std::vector<CameraHealth>& cameras)>;
 
-/// Takes jobs from the queue and runs each in a process of its own, so that no input can take the daemon down.
+/// Takes jobs from the queue and runs each in a process of its own, so that no input can take the daemon down. One that
+/// dies, hangs or takes too much memory is tried again after the others, and set aside as failed when that repeats.
 ///
 /// The process says on descriptor 3, one JSON object a line, how far it is: {"stage": "hull", "fraction": 0.42}, the
 /// fraction that of the whole job; what it found out about each camera and, when that is all, null:

@@ -559,7 +559,7 @@ TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
       triangles = 9999999999999
       )"),
       testing::UnorderedElementsAre(
-          "colour: \"red\", expected one of the keys booth, api, capture, background, calibration, disk, jobs, log, cameras, "
+          "colour: \"red\", expected one of the keys booth, api, capture, background, calibration, disk, retention, jobs, log, cameras, "
           "trigger, "
           "projector, replay, "
           "face, reconstruct, export",

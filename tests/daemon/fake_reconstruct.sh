@@ -53,6 +53,7 @@ case $(cat "$here/behaviour") in
     say '{"stage": "hull", "fraction": 0.3}'
     exec sleep 1000
     ;;
+  glutton) exec /usr/bin/python3 -c 'import time; taken = b"x" * (400 << 20); time.sleep(1000)' ;;
   slow)
     say '{"stage": "hull", "fraction": 0.3}'
     sleep 0.3

@@ -17,6 +17,7 @@ class Jobs : public TestBooth {
     start();
   }
   std::string quick_capture() { return capture({{"face", "none"}}); }
+  bool session_busy() { return !call("system.status")["capture"].is_null(); }
   bool avatars_are_clean() { return entries(options_.config.booth.avatars()).empty(); }
 };
 
@@ -77,6 +78,20 @@ TEST_F(Jobs, TakesNoLongerThanAllowed) {
   const std::string id = quick_capture();
   ASSERT_TRUE(wait_job(id, "failed"));
   EXPECT_EQ(job(id)["error"]["kind"], "timeout");
+  EXPECT_EQ(reconstruct_.calls(), 2) << "it was tried again once";
+  reconstruct_.behave("good");
+  EXPECT_TRUE(wait_job(quick_capture(), "done")) << "the next one runs";
+}
+
+TEST_F(Jobs, TakesNoMoreMemoryThanAllowed) {
+  options_.config.jobs.memory_mib = 200;
+  start_with("glutton");
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "failed"));
+  EXPECT_EQ(job(id)["error"]["kind"], "out_of_memory");
+  EXPECT_EQ(reconstruct_.calls(), 2) << "it was tried again once";
+  reconstruct_.behave("good");
+  EXPECT_TRUE(wait_job(quick_capture(), "done")) << "the next one runs";
 }
 
 TEST_F(Jobs, TheBoothTakesTheNextCaptureMeanwhile) {
@@ -214,6 +229,75 @@ TEST_F(Jobs, AnAvatarThatAppearedBeforeTheCrashIsPublished) {
   start();
   EXPECT_TRUE(wait_job(id, "done"));
   EXPECT_EQ(reconstruct_.calls(), calls);
+}
+
+TEST_F(Jobs, ADoneOneWithoutItsAvatarIsDoneAgainAtTheStart) {
+  start();
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "done"));
+  stop();
+  fs::remove_all(options_.config.booth.avatars() / id);
+  start();
+  EXPECT_TRUE(wait_until([&] { return fs::exists(options_.config.booth.avatars() / id); }));
+  EXPECT_TRUE(wait_job(id, "done"));
+}
+
+TEST_F(Jobs, AnAvatarWithoutAJobKeepsItAndIsNotMadeAgain) {
+  start();
+  const std::string id = quick_capture();
+  ASSERT_TRUE(wait_job(id, "done"));
+  stop();
+  fs::remove(options_.config.booth.jobs() / (id + ".json"));
+  start();
+  EXPECT_EQ(job(id)["state"], "done");
+  EXPECT_EQ(reconstruct_.calls(), 1);
+}
+
+/// A queue that another version of the program left.
+TEST_F(Jobs, AQueueSurvivesAnUpgradeAndTheWayBack) {
+  start_with("hang");
+  std::vector<std::string> ids;
+  for (int i = 0; i < 3; ++i) {
+    ids.push_back(quick_capture());
+    ASSERT_TRUE(wait_until([&] { return !session_busy(); }));
+  }
+  ASSERT_TRUE(wait_job(ids[2], "queued"));
+  stop();
+  const fs::path folder = options_.config.booth.jobs();
+  // The first program's, a newer one's, and this one's.
+  std::ofstream(folder / (ids[0] + ".json"))
+      << Json{{"id", ids[0]}, {"face", "none"}, {"label", ""}, {"died", 0}, {"interrupted", 1}, {"state", "running"}};
+  std::ofstream(folder / (ids[1] + ".json"))
+      << Json{{"version", 7}, {"id", ids[1]}, {"state", "waiting_for_cloud"}, {"priority", "high"}};
+  EXPECT_EQ(Json::parse(std::ifstream(folder / (ids[2] + ".json")))["version"], 1);
+  reconstruct_.behave("good");
+  start();
+  for (const std::string& id : ids) EXPECT_TRUE(wait_job(id, "done")) << id;
+}
+
+TEST(JobQueue, AJobThatDiedWaitsForTheOthers) {
+  const ScratchFolder folder;
+  EventBus events;
+  auto queue = JobQueue::open(folder.path(), events);
+  ASSERT_TRUE(queue);
+  for (const char* id : {"a", "b", "c"}) (*queue)->add({.id = id, .face = "auto"}), (*queue)->release(id);
+  const auto take = [&] { return (*queue)->take({}, std::chrono::milliseconds(0)); };
+  const auto first = take();
+  ASSERT_EQ(first->job.id, "a");
+  EXPECT_TRUE((*queue)->died(*first, 1, {"internal", "it crashed"}));
+  (*queue)->release(*first);
+  for (const char* id : {"b", "c", "a"}) {
+    const auto next = take();
+    ASSERT_EQ(next->job.id, id);
+    if (next->job.id == "a") {
+      (*queue)->died(*next, 1, {"internal", "it crashed"});
+    } else {
+      (*queue)->finish(*next);
+    }
+    (*queue)->release(*next);
+  }
+  EXPECT_EQ((*queue)->find("a")->state, JobState::failed);
+  EXPECT_FALSE(take());
 }
 
 TEST(JobQueue, AJobThatIsThereWheneverTheDaemonDiesFailsAtLast) {
