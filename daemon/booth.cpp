@@ -4,8 +4,6 @@
 #include <pthread.h>
 #include <spdlog/spdlog.h>
 #include <sys/file.h>
-#include <sys/stat.h>
-#include <sys/statvfs.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -14,12 +12,14 @@
 #include <exception>
 #include <fstream>
 #include <future>
+#include <limits>
 #include <set>
 #include <system_error>
 #include <utility>
 
 #include "daemon/identifier.h"
 #include "daemon/projector_delay.h"
+#include "daemon/retention.h"
 #include "pipeline/types/rig.h"
 #include "replay/durable_folder.h"
 
@@ -33,7 +33,10 @@ constexpr uint64_t mebibyte = 1024 * 1024;
 constexpr size_t most_disk_tasks = 256;
 constexpr std::chrono::milliseconds house_pause{250};
 constexpr std::chrono::milliseconds heartbeat_pause{1000};
-constexpr std::chrono::milliseconds disk_pause{2000};        ///< between two looks at the space
+constexpr std::chrono::milliseconds disk_pause{2000};  ///< between two looks at the space
+constexpr std::chrono::hours sweep_pause{1};           ///< between two looks for what could not be removed at once
+/// What a process of the last run was still dying in could not be removed at the start.
+constexpr std::chrono::seconds first_sweep{10};
 constexpr std::chrono::minutes relearning_pause{5};          ///< between two tries to learn the background unasked
 constexpr std::chrono::milliseconds drain_patience{10'000};  ///< for a capture under way
 
@@ -42,22 +45,6 @@ ErrorCode code_of(const std::string& kind) {
                                ErrorCode::disk_full, ErrorCode::not_ready})
     if (kind == to_string(code)) return code;
   return ErrorCode::device_lost;
-}
-
-std::string in_mebibytes(uint64_t bytes) { return std::to_string(bytes / mebibyte) + " MiB"; }
-
-/// Bytes of all files below a folder; a file with several names counts once.
-uint64_t size_of_tree(const fs::path& folder) {
-  std::set<ino_t> seen;
-  uint64_t bytes = 0;
-  std::error_code code;
-  for (fs::recursive_directory_iterator entry(folder, code), end; !code && entry != end; entry.increment(code)) {
-    struct stat status {};
-    if (::lstat(entry->path().c_str(), &status) != 0 || !S_ISREG(status.st_mode)) continue;
-    if (status.st_nlink == 1 || seen.insert(status.st_ino).second)
-      bytes += static_cast<uint64_t>(status.st_blocks) * 512;
-  }
-  return bytes;
 }
 
 /// Of this process; 0 where the system does not say.
@@ -75,13 +62,14 @@ Booth::Booth(const BoothOptions& options, const Clock& clock)
       clock_(clock),
       health_(options.config.background, events_),
       disk_executor_("disk", most_disk_tasks),
+      disk_guard_(options.config.booth, options.config.disk, options.free_space),
       state_since_(std::chrono::system_clock::now()) {}
 
 Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<Devices> devices, const Clock& clock) {
   std::unique_ptr<Booth> booth(new Booth(options, clock));
   if (const auto locked = booth->lock_state(); !locked) return locked.error();
   if (const auto opened = booth->open_stores(); !opened) return opened.error();
-  booth->measure_disk();
+  booth->disk_guard_.measure();
   if (const auto opened = booth->open_calibration(devices); !opened) return opened.error();
   if (devices) {
     booth->open_capture(*devices);
@@ -150,7 +138,8 @@ Result<void> Booth::open_stores() {
   std::error_code code;
   fs::create_directories(booth.recordings(), code);
   if (code) return Error{ErrorCode::io, booth.recordings().string() + ": cannot be made: " + code.message()};
-  if (const auto removed = remove_partial_folders(booth.recordings()); !removed) return removed.error();
+  for (const fs::path& folder : {booth.recordings(), booth.state_directory, booth.rig().parent_path()})
+    if (const auto removed = remove_partial_folders(folder); !removed) return removed.error();
   auto jobs = JobQueue::open(booth.jobs(), events_);
   if (!jobs) return jobs.error();
   jobs_ = std::move(*jobs);
@@ -247,7 +236,7 @@ void Booth::open_capture(const Devices& devices) {
                    .metrics = metrics_,
                    .clock = clock_,
                    .set_state = [this](BoothState state) { set_state(state); },
-                   .check_disk = [this] { return check_disk(); },
+                   .check_disk = [this](int frames, bool patterns) { return check_disk(frames, patterns); },
                    .background_learned =
                        [this](const Result<void>& learned) {
                          if (learned) return health_.background_learned();
@@ -354,7 +343,7 @@ std::vector<Reason> Booth::find_reasons(BoothState state) const {
   }
   if (backgrounds_->current() == nullptr)
     reasons.push_back({"no_background", "the booth has not learned its background yet"});
-  if (const auto disk = check_disk(); !disk) reasons.push_back({"disk_full", disk.error().message});
+  if (const auto disk = check_disk(1, true); !disk) reasons.push_back({"disk_full", disk.error().message});
   return reasons;
 }
 
@@ -487,24 +476,38 @@ std::vector<PreviewPicture> Booth::take_previews() {
   return previews_->take();
 }
 
-Result<void> Booth::check_disk() const {
-  const DiskConfig& disk = options_.config.disk;
-  const uint64_t reserve = static_cast<uint64_t>(disk.reserve_mib) * mebibyte;
-  const uint64_t limit = static_cast<uint64_t>(disk.limit_mib) * mebibyte;
-  if (free_bytes_ < reserve)
-    return Error{ErrorCode::disk_full, in_mebibytes(free_bytes_) + " are free on the disk, at least " +
-                                           in_mebibytes(reserve) + " must be: delete avatars or make room"};
-  if (limit > 0 && used_bytes_ > limit)
-    return Error{ErrorCode::disk_full, "recordings and avatars take " + in_mebibytes(used_bytes_) + " of the " +
-                                           in_mebibytes(limit) + " allowed: delete avatars"};
-  return {};
+uint64_t Booth::capture_bytes(int frames, bool patterns) const {
+  const auto rig = this->rig();
+  return rig ? largest_capture_bytes(*rig, options_.config.capture.images, frames, patterns) : 0;
 }
 
-void Booth::measure_disk() {
-  const fs::path& folder = options_.config.booth.state_directory;
-  struct statvfs space {};
-  if (::statvfs(folder.c_str(), &space) == 0) free_bytes_ = static_cast<uint64_t>(space.f_bavail) * space.f_frsize;
-  if (options_.config.disk.limit_mib > 0) used_bytes_ = size_of_tree(folder);
+Result<void> Booth::check_disk(int frames, bool patterns) const {
+  return disk_guard_.check(capture_bytes(frames, patterns));
+}
+
+/// Deletes what the configuration wants deleted; the next round comes when that is done.
+void Booth::make_room() {
+  const RetentionConfig& config = options_.config.retention;
+  if (retiring_ > 0 || (config.max_age_h == 0 && config.max_captures == 0 && !config.make_room)) return;
+  const auto avatars = avatars_->list(std::numeric_limits<size_t>::max(), "");
+  if (!avatars) return;
+  for (const std::string& id :
+       avatars_to_delete(config, *avatars, *jobs_, std::chrono::system_clock::now(), check_disk(1, true).ok())) {
+    spdlog::info("avatar {}: deleted with its recording, as [retention] says", id);
+    metrics_.add("retired");
+    ++retiring_;
+    const auto begun = delete_avatar(id, [this](const Result<void>&) {
+      --retiring_;  // what went wrong is in the log, and the next round tries again
+    });
+    if (!begun) --retiring_;
+  }
+}
+
+/// A disk may have failed to remove what was deleted or given up; a booth runs for months between two starts.
+void Booth::sweep() const {
+  const IdentityConfig& booth = options_.config.booth;
+  for (const fs::path& folder : {booth.recordings(), booth.avatars(), booth.backgrounds()})
+    if (const auto removed = remove_partial_folders(folder); !removed) spdlog::warn("{}", removed.error().message);
 }
 
 std::optional<std::chrono::seconds> Booth::background_age() const {
@@ -541,16 +544,21 @@ void Booth::tend_background() {
 }
 
 void Booth::keep_house(const std::stop_token& stop) {
-  auto next_heartbeat = SteadyClock::now(), next_disk = next_heartbeat;
+  auto next_heartbeat = SteadyClock::now(), next_disk = next_heartbeat, next_sweep = next_heartbeat + first_sweep;
   bool disk_was_full = false;
   while (!stop.stop_requested()) {
     house_pulse_.beat();
     try {
       const auto now = SteadyClock::now();
       if (now >= next_disk) {
-        measure_disk();
+        disk_guard_.measure();
         next_disk = SteadyClock::now() + disk_pause;
-        const auto disk = check_disk();
+        make_room();
+        if (now >= next_sweep) {
+          sweep();
+          next_sweep = now + sweep_pause;
+        }
+        const auto disk = check_disk(1, true);
         if (!disk && !disk_was_full) events_.publish(Alert{Severity::error, "disk_full", disk.error().message});
         disk_was_full = !disk;
         tend_background();
@@ -597,7 +605,11 @@ BoothStatus Booth::status() const {
   }
   for (Job& job : jobs_->list())
     if (job.state != JobState::done) status.queue.push_back(std::move(job));
-  status.disk = {free_bytes_, static_cast<uint64_t>(options_.config.disk.reserve_mib) * mebibyte};
+  status.disk = {.free_bytes = disk_guard_.free_bytes(),
+                 .limit_bytes = disk_guard_.reserve_bytes(),
+                 .used_bytes = disk_guard_.used_bytes(),
+                 .quota_bytes = disk_guard_.quota_bytes(),
+                 .capture_bytes = capture_bytes(1, true)};
   status.uptime_s = std::chrono::duration<double>(SteadyClock::now() - started_).count();
   return status;
 }
@@ -608,7 +620,8 @@ std::map<std::string, double> Booth::measurements() const {
   values["resident_bytes"] = resident_bytes();
   values["events"] = static_cast<double>(events_.sequence());
   values["events_lost"] = static_cast<double>(events_.lost());
-  values["disk_free_bytes"] = static_cast<double>(free_bytes_.load());
+  values["disk_free_bytes"] = static_cast<double>(disk_guard_.free_bytes());
+  values["disk_used_bytes"] = static_cast<double>(disk_guard_.used_bytes());
   for (const JobState state :
        {JobState::queued, JobState::running, JobState::failed, JobState::done, JobState::cancelled})
     values["jobs_now_" + std::string(to_string(state))] = 0;

@@ -18,6 +18,7 @@
 #include "daemon/calibration_desk.h"
 #include "daemon/camera_supervisor.h"
 #include "daemon/capture_session.h"
+#include "daemon/disk_guard.h"
 #include "daemon/eraser.h"
 #include "daemon/event_bus.h"
 #include "daemon/health_monitor.h"
@@ -64,6 +65,7 @@ struct BoothOptions {
   std::filesystem::path reconstruct_command;  ///< see JobRunnerOptions::command
   std::filesystem::path calibrate_command;    ///< see CalibrationDeskOptions::command
   DelayCalibrationOptions delay_calibration = {.max_delay_ms = 300, .repeats = 3};  ///< some ten seconds
+  FreeSpace free_space = free_space_at;
 };
 
 struct CalibrationStatus {
@@ -80,7 +82,10 @@ struct BackgroundStatus {
 };
 struct DiskStatus {
   uint64_t free_bytes = 0;
-  uint64_t limit_bytes = 0;  ///< with less free no capture starts
+  uint64_t limit_bytes = 0;    ///< with less free no capture starts
+  uint64_t used_bytes = 0;     ///< of recordings, avatars and backgrounds
+  uint64_t quota_bytes = 0;    ///< most that these may take; 0: there is no such limit
+  uint64_t capture_bytes = 0;  ///< most that the next capture may take
 };
 
 /// Everything at one instant.
@@ -183,8 +188,10 @@ class Booth {
   std::vector<Reason> find_reasons(BoothState state) const;
   void find_calibration_reasons(std::vector<Reason>& reasons) const;
   Result<void> check_ready(const std::vector<std::string>& tolerated) const;
-  Result<void> check_disk() const;
-  void measure_disk();
+  Result<void> check_disk(int frames, bool patterns) const;
+  uint64_t capture_bytes(int frames, bool patterns) const;
+  void make_room();
+  void sweep() const;
   void keep_house(const std::stop_token& stop);
   std::optional<std::chrono::seconds> background_age() const;
   void tend_background();
@@ -220,7 +227,8 @@ class Booth {
   std::unique_ptr<Eraser> eraser_;
   std::unique_ptr<SerialExecutor> discoverer_;  ///< looking for cameras takes seconds
 
-  std::atomic<uint64_t> free_bytes_{0}, used_bytes_{0};
+  DiskGuard disk_guard_;
+  std::atomic<int> retiring_{0};  ///< deletions of make_room() that are under way
   mutable std::mutex state_mutex_;
   BoothState state_ = BoothState::starting;            ///< guarded by state_mutex_
   std::chrono::system_clock::time_point state_since_;  ///< guarded by state_mutex_

@@ -290,7 +290,9 @@ bool CaptureSession::conclude(const std::string& id, const CaptureRequest& reque
 
 Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& request,
                                   const std::stop_token& cancelled) {
-  if (const auto room = parts_.check_disk(); !room) return room;
+  if (const auto room = parts_.check_disk(1, request.face == FaceMode::active || request.face == FaceMode::automatic);
+      !room)
+    return room;
   const auto rig = parts_.rig();
   if (rig == nullptr) return Error{ErrorCode::not_calibrated, "the booth is not calibrated"};
   const auto background = parts_.backgrounds.current();
@@ -608,7 +610,7 @@ Result<TaskResult> CaptureSession::work(const std::string& task, const Backgroun
 
 Result<TaskResult> CaptureSession::learn(const std::string& task, const BackgroundRequest& request,
                                          const std::stop_token& cancelled) {
-  if (const auto room = parts_.check_disk(); !room) return room.error();
+  if (const auto room = parts_.check_disk(request.frames, false); !room) return room.error();
   const auto rig = parts_.rig();
   if (rig == nullptr) return Error{ErrorCode::not_calibrated, "the booth is not calibrated"};
   const auto now = std::chrono::system_clock::now();

@@ -78,7 +78,8 @@ struct CaptureParts {
   Metrics& metrics;
   const Clock& clock;
   std::function<void(BoothState)> set_state;  ///< called without a lock held
-  std::function<Result<void>()> check_disk;   ///< @error disk_full
+  /// Whether there is room for so many frames of each camera, and the patterns. @error disk_full
+  std::function<Result<void>(int frames, bool patterns)> check_disk;
   /// Called when the background was learned, or could not be learned unattended.
   std::function<void(const Result<void>&)> background_learned = [](const Result<void>&) {};
 };

@@ -202,9 +202,12 @@ Result<void> DurableFolder::commit() {
       return Error{ErrorCode::invalid_state, final_.string() + ": is there already"};
     return write_error("cannot be made", final_, errno);
   }
+  const auto flushed = flush_folder(final_.parent_path().empty() ? fs::path(".") : final_.parent_path());
+  // Who is told of a failure must find nothing there. A disk that does not even take it back has it, whole.
+  if (!flushed && ::rename(final_.c_str(), partial_.c_str()) == 0) return flushed;
   partial_.clear();
   ::close(std::exchange(lock_, -1));
-  return flush_folder(final_.parent_path().empty() ? fs::path(".") : final_.parent_path());
+  return {};
 }
 
 Result<void> write_file_atomically(const fs::path& file, std::span<const uint8_t> bytes) {

@@ -45,7 +45,7 @@ class DurableFolder {
   Result<void> write(const std::string& file, std::string_view text);
 
   /// Flushes every file and folder and lets the folder appear at final_path(). Afterwards the object is done.
-  /// An empty folder that is already there is replaced.
+  /// An empty folder that is already there is replaced. After an error nothing has appeared.
   ///
   /// @error invalid_state  something that is not an empty folder is already there; @error disk_full, io
   Result<void> commit();

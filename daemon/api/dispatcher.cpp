@@ -179,7 +179,12 @@ Answer Dispatcher::status() const {
                   {"created", text_or_null(status.background.created)},
                   {"stale", text_or_null(status.background.stale.value_or(""))}}},
                 {"queue", to_json(status.queue)},
-                {"disk", {{"free_bytes", status.disk.free_bytes}, {"limit_bytes", status.disk.limit_bytes}}},
+                {"disk",
+                 {{"free_bytes", status.disk.free_bytes},
+                  {"limit_bytes", status.disk.limit_bytes},
+                  {"used_bytes", status.disk.used_bytes},
+                  {"quota_bytes", status.disk.quota_bytes},
+                  {"capture_bytes", status.disk.capture_bytes}}},
                 {"uptime_s", status.uptime_s}}};
 }
 

@@ -32,6 +32,7 @@ except ImportError as missing:
 
 MINI = pathlib.Path(__file__).resolve().parents[2] / "replay/recordings/mini"
 SESSION_WITHIN_S = 60
+SWEPT_WITHIN_S = 20
 MOST_KEPT = 12  # captures; the oldest are deleted, as a test of their own
 
 OFF, FAIL, TEAR, KILL_SELF, KILL_ALL = range(5)
@@ -162,7 +163,8 @@ class Campaign:
             self.booth.call("job.retry", job=job["id"])
         self.booth.wait_idle()
 
-        recordings, avatars = names(state / "recordings"), names(state / "avatars")
+        recordings, avatars = ([n for n in names(state / folder) if not n.startswith(".")]
+                               for folder in ("recordings", "avatars"))
         jobs = {j["id"]: j for j in self.booth.call("job.list")["jobs"]}
         listed = {a["id"] for a in self.booth.call("avatar.list", limit=500)["avatars"]}
         for capture in self.acknowledged:
@@ -182,9 +184,10 @@ class Campaign:
             wrong += [f"avatar {avatar}: {f}" for f in faults_of_avatar(state / "avatars" / avatar)]
         if set(avatars) != listed:
             wrong.append(f"avatars on the disk {avatars}, listed {sorted(listed)}")
-        left = self.left_overs()
-        if left:
-            time.sleep(0.5)  # a file may have been in the making
+        # A file may be in the making, and what a dying process still had is removed a while after the start.
+        left, deadline = self.left_overs(), time.monotonic() + SWEPT_WITHIN_S
+        while left and time.monotonic() < deadline:
+            time.sleep(0.1)
             left &= self.left_overs()
         wrong += sorted(left)
         if wrong:
@@ -378,6 +381,7 @@ class Campaign:
         self.booth.start(self.environment)
         self.session()
         self.booth.wait_idle()
+        self.booth.stop()  # which ends what is being written
         dirty, wrong = set(), []
         for line in log.read_text().splitlines():
             operation, path, *other = line.split("\t")
@@ -404,6 +408,7 @@ class Campaign:
         if wrong:
             self.found.append(("flushes", wrong))
             print("  " + "; ".join(wrong))
+        self.booth.start(self.environment)
 
     def all(self, only):
         assert self.booth.start(self.environment), self.booth.log()
