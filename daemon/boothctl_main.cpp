@@ -24,6 +24,7 @@
 #include "daemon/boothctl/doctor.h"
 #include "daemon/boothctl/keys.h"
 #include "daemon/boothctl/report.h"
+#include "daemon/boothctl/traces.h"
 #include "daemon/identifier.h"
 #include "pipeline/calibration/board_pdf.h"
 #include "pipeline/export/sha256.h"
@@ -564,6 +565,7 @@ int main(int argc, char** argv) {
   booth::add_report_command(app, connect, offline);
   booth::add_metrics_command(app, connect, options.json, offline);
   booth::add_keys_command(app, options.json, offline);
+  booth::add_traces_command(app, options.json, offline);
   auto* projector = app.add_subcommand("projector", "what lights the face with patterns");
   projector->require_subcommand(1);
   projector

@@ -264,6 +264,33 @@ TEST_F(Process, TheReportHoldsNothingOfTheVisitors) {
       << "also without the booth";
 }
 
+/// What is deleted is gone from all that the booth stores; what it logs never had a name in it.
+TEST_F(Process, NothingIsLeftOfWhoWasDeleted) {
+  constexpr const char* label = "Zo\xc3\xab Quisling";
+  const auto traces = [&](const std::vector<std::string>& words) {
+    std::vector<std::string> command{"traces", "--config", config_};
+    command.insert(command.end(), words.begin(), words.end());
+    return boothctl(command);
+  };
+  start_boothd();
+  std::vector<std::string> ids;
+  for (const char* behaviour : {"good", "fail", "crash"}) {
+    reconstruct_.behave(behaviour);
+    ids.push_back(capture({{"face", "none"}, {"label", label}, {"key", std::string("press-") + behaviour}}));
+    ASSERT_TRUE(wait_until([&] { return job(ids.back())["state"] == (ids.size() == 1 ? "done" : "failed"); }));
+  }
+  EXPECT_EQ(traces({ids[0]}).first, 1);
+  EXPECT_THAT(traces({label}).second, testing::HasSubstr(ids[1]));
+  EXPECT_EQ(call("avatar.delete", {{"avatar", ids[0]}}), Json::object());
+  for (const std::string& id : ids) call("capture.delete", {{"capture", id}});
+  ASSERT_TRUE(wait_until([&] { return entries(options_.config.booth.state_directory / "deleting").empty(); }));
+  const auto [status, output] = traces({ids[0], ids[1], ids[2], label});
+  EXPECT_EQ(status, 0) << output;
+  EXPECT_EQ(traces({label, "--log", folder_.path() / "log"}).first, 0) << "a label is in the log";
+  EXPECT_EQ(traces({ids[0], "--log", folder_.path() / "log"}).first, 1) << "the log is searched";
+  EXPECT_EQ(traces({"press-good"}).first, 1) << "the clients' own words are kept for a day";
+}
+
 TEST_F(Process, RefusesABadConfiguration) {
   EXPECT_EQ(run({BOOTHD, "--config", config_, "--reconstruct", reconstruct_.path(), "--check"}).first, 0);
   std::ofstream(config_) << "[jobs]\nworkers = 0\n[disk]\nreserve = 1\n";
