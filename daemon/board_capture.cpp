@@ -23,7 +23,7 @@ Result<std::string> CaptureSession::capture_board(const BoardRequest& request) {
 /// its own, and the operator hears who is missing.
 Result<TaskResult> CaptureSession::work(const std::string& task, const BoardRequest& request,
                                         const std::stop_token& cancelled) {
-  if (const auto room = parts_.check_disk(1, false); !room) return room.error();
+  if (const auto room = parts_.check_disk(1, request.patterns); !room) return room.error();
   BoardPictures pictures;
   pictures.floor = request.floor;
   CollectedShot shot;
