@@ -309,6 +309,7 @@ class KmsProjector final : public FlippingProjector {
     flip_ = {};
     if (drmModePageFlip(fd, output_.crtc, buffers_[buffer]->id(), DRM_MODE_PAGE_FLIP_EVENT, &flip_) != 0)
       return failed("it does not flip", errno);
+    shown_ = buffer;  // or will be, even if nobody is told: what hangs may go through later
     drmEventContext context;
     std::memset(&context, 0, sizeof context);
     context.version = 2;
@@ -327,7 +328,6 @@ class KmsProjector final : public FlippingProjector {
       }
       if (drmHandleEvent(fd, &context) != 0) return failed("it does not say when it flips", errno);
     }
-    shown_ = buffer;
     return flip_.when;
   }
 
