@@ -408,6 +408,18 @@ TEST_F(AravisSuite, RefusesWhatTheCameraCannotWithItsRange) {
        },
        "features.Gain: \"loud\", expected a number"},
       {[](auto& c) {
+         c.features = {{"GevSCPD", "0.5"}};
+       },
+       "features.GevSCPD: \"0.5\", expected a whole number"},
+      {[](auto& c) {
+         c.features = {{"PtpEnable", "yes"}};
+       },
+       "features.PtpEnable: \"yes\", expected true or false"},
+      {[](auto& c) {
+         c.features = {{"ExposureMode", "Bulb"}};
+       },
+       "features.ExposureMode: \"Bulb\", but the camera offers Timed"},
+      {[](auto& c) {
          c.features = {{"Width", "64"}};
        },
        "features: Width is 64 after they were set, expected 160"},
@@ -431,6 +443,56 @@ TEST_F(AravisSuite, RefusesAFeatureThatTheCameraHasNot) {
   settings.cameras[0].response = AravisResponse::srgb;
   EXPECT_EQ(refusal().message, "camera cam-0: response: srgb, but the camera has no Gamma");
   EXPECT_EQ(refusal().code, ErrorCode::unsupported);
+}
+
+/// A camera that confirms a setting and goes on as before.
+TEST_F(AravisSuite, RefusesAValueThatTheCameraDoesNotKeep) {
+  struct Case {
+    const char* keeps;
+    std::function<void(AravisCameraSettings&)> ask;
+    const char* message;
+  };
+  const Case cases[] = {
+      {"ExposureTime", [](auto&) {}, "camera cam-0: exposure_us: 1000, but the camera made it 5000"},
+      {"Width", [](auto& c) { c.region.width = 64; }, "camera cam-0: region.width: 64, but the camera made it 160"},
+      {"TriggerSource", [](auto& c) { c.trigger_line = "Line2"; },
+       "camera cam-0: trigger_line: \"Line2\", but the camera made it \"Line1\""},
+      {"PtpEnable", [](auto& c) { c.ptp = true; }, "camera cam-0: ptp: true, but the camera did not take it"}};
+  for (const Case& one : cases) {
+    source.reset();
+    settings.cameras.clear();
+    peers.clear();
+    add_camera({.keeps = one.keeps});
+    one.ask(settings.cameras[0]);
+    const Error error = refusal();
+    EXPECT_EQ(error.code, ErrorCode::invalid_argument) << one.message;
+    EXPECT_EQ(error.message, one.message);
+  }
+}
+
+/// What is asked for must be there, whatever kind of setting it is.
+TEST_F(AravisSuite, NamesTheFeatureThatASettingNeeds) {
+  struct Case {
+    const char* lacks;
+    std::function<void(AravisCameraSettings&)> ask;
+    const char* message;
+  };
+  const Case cases[] = {{"Gain", [](auto& c) { c.gain_db = 3; }, "camera cam-0: gain_db: it has no Gain"},
+                        {"PixelFormat", [](auto&) {}, "camera cam-0: pixel_format: it has no PixelFormat"},
+                        {"BalanceRatioSelector", [](auto& c) { c.white_balance_red = 2; },
+                         "camera cam-0: white_balance_red: it has no BalanceRatioSelector"},
+                        {"ActionSelector", [](auto& c) { c.trigger = AravisTriggerSource::action; },
+                         "camera cam-0: action: it has no ActionSelector"}};
+  for (const Case& one : cases) {
+    source.reset();
+    settings.cameras.clear();
+    peers.clear();
+    add_camera({.lacks = one.lacks});
+    one.ask(settings.cameras[0]);
+    const Error error = refusal();
+    EXPECT_EQ(error.code, ErrorCode::unsupported) << one.message;
+    EXPECT_EQ(error.message, one.message);
+  }
 }
 
 TEST_F(AravisSuite, RefusesPtpOfACameraWithout) {
@@ -479,6 +541,7 @@ TEST_F(AravisSuite, ACameraIsOpenedOnceAndOnlyWhereItIsConfigured) {
   EXPECT_EQ(source->open_camera("other").error().message, "no camera other is configured");
   EXPECT_EQ(source->open_trigger().error().message,
             "every camera is triggered by its line, which another driver pulses");
+  EXPECT_EQ(source->open_projector().error().message, "cameras are no projectors");
   EXPECT_EQ(camera->arm({.role = ShotRole::body}, 0).error().message, "camera cam-0: cannot be armed for 0 frames");
   EXPECT_EQ(camera->wait_frame(soon()).error().message, "camera cam-0: is not armed");
   ASSERT_TRUE(arm(*camera, 1));
@@ -674,6 +737,30 @@ TEST_F(AravisSuite, AnActionIsNotScheduledByClocksThatDoNotAgree) {
   ASSERT_FALSE(fired);
   EXPECT_THAT(fired.error().message, AllOf(HasSubstr("action: schedule_ahead_us: the clocks of cam-0 and cam-1 are "),
                                            HasSubstr(" ms apart: they must follow one PTP master")));
+}
+
+TEST_F(AravisSuite, AnActionIsNotScheduledByAClockThatCannotBeRead) {
+  add_camera({.lacks = "TimestampLatch"});
+  settings.action = {.schedule_ahead_us = 300'000};
+  settings.cameras[0].trigger = AravisTriggerSource::action;
+  const auto camera = open();
+  ASSERT_TRUE(camera && arm(*camera, 1));
+  const auto fired = (*source->open_trigger())->fire();
+  ASSERT_FALSE(fired);
+  EXPECT_EQ(fired.error().code, ErrorCode::device_lost);
+  EXPECT_EQ(fired.error().message, "action: schedule_ahead_us: no camera's clock can be read to schedule by");
+}
+
+TEST_F(AravisSuite, ASoftwareTriggerThatNoCameraTakesIsReported) {
+  add_camera({.lacks = "TriggerSoftware"});
+  settings.cameras[0].trigger = AravisTriggerSource::software;
+  const auto camera = open();
+  ASSERT_TRUE(camera && arm(*camera, 1));
+  const auto fired = (*source->open_trigger())->fire();
+  ASSERT_FALSE(fired);
+  EXPECT_EQ(fired.error().code, ErrorCode::device_lost);
+  EXPECT_EQ(fired.error().message, "camera cam-0: TriggerSoftware: [TriggerSoftware] Not found");
+  EXPECT_THAT(all_warnings(), testing::ElementsAre(fired.error().message));
 }
 
 TEST_F(AravisSuite, ACameraThatHangsDelaysNeitherTheOthersNorTheTrigger) {

@@ -135,6 +135,7 @@ TEST_F(Gpio, EveryFailureLeavesAllLinesAtRest) {
     const auto fired = line->fire();
     ASSERT_FALSE(fired);
     EXPECT_EQ(fired.error().code, ErrorCode::device_lost);
+    EXPECT_THAT(fired.error().message, testing::AnyOf("T cannot be set", "L cannot be set"));
     EXPECT_TRUE(all_at_rest()) << works_for;
   }
 }
@@ -208,6 +209,19 @@ TEST_F(Gpio, AProjectorThatFailedStartsOverAndIsDark) {
   }
 }
 
+TEST_F(Gpio, AProjectorWhoseLinesCannotBeHadOrSetIsNamed) {
+  for (const char* line : {"S", "R"}) {
+    gpio->missing = {line};
+    EXPECT_EQ(open_gpio_projector(stepped(), *gpio, gpio).error().message,
+              std::string("projector: line ") + line + " is gone");
+    EXPECT_TRUE(gpio->held.empty());
+  }
+  gpio->missing.clear();
+  gpio->works_for = 0;
+  EXPECT_EQ(open_gpio_projector(stepped(), *gpio, gpio).error().message, "projector: R cannot be set");
+  EXPECT_TRUE(gpio->held.empty());
+}
+
 TEST_F(Gpio, WhatAKilledProcessLeftActiveIsBroughtToRest) {
   const auto trigger_lines = lit();
   const auto projector_lines = stepped();
@@ -243,10 +257,16 @@ TEST_F(Gpio, BadSettingsAreNamed) {
   EXPECT_EQ(fault(bad), "gpio.trigger and gpio.lights are both line T of gpiochip0");
   bad = lit();
   bad.lights_hold_us = -1;
-  EXPECT_THAT(fault(bad), HasSubstr("lights_hold_us is -1"));
+  EXPECT_EQ(fault(bad), "gpio: lights_hold_us is -1, expected 0 … 1000000");
   auto projector = stepped();
   projector.reset.chip.clear();
   EXPECT_EQ(fault(projector), "projector.reset: chip is empty, expected a GPIO chip");
+  projector = stepped();
+  projector.reset.line = "S";
+  EXPECT_EQ(fault(projector), "projector.step and projector.reset are both line S of gpiochip0");
+  projector = stepped();
+  projector.id = "a/b";
+  EXPECT_EQ(fault(projector), "gpio projector: id is \"a/b\", expected a file-name safe name");
   projector = stepped();
   projector.pattern.width = 0;
   EXPECT_EQ(fault(projector), "projector: width is 0, expected 1 … 16384");
@@ -257,7 +277,9 @@ TEST(LinuxGpio, AChipThatIsNotThereIsNamed) {
   const auto opened = open_gpio_trigger({.trigger = {.chip = "no-such-chip", .line = "0"}}, clock);
   ASSERT_FALSE(opened);
   EXPECT_EQ(opened.error().code, ErrorCode::device_lost);
-  EXPECT_THAT(opened.error().message, HasSubstr("gpio trigger: line 0 of no-such-chip cannot be had"));
+  EXPECT_EQ(opened.error().message,
+            "gpio trigger: line 0 of no-such-chip cannot be had, as the chip cannot be opened: No such file or "
+            "directory");
 }
 
 }  // namespace

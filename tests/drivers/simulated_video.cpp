@@ -121,6 +121,7 @@ struct SimulatedVideo::Device {
 
   int request_buffers(v4l2_requestbuffers& request) {
     if (streaming) return -EBUSY;
+    request.count = std::min(request.count, node.most_buffers);
     buffers.assign(request.count, std::vector<uint8_t>((size_image() / page + 1) * page));
     lent.clear();
     return 0;
@@ -255,6 +256,7 @@ int SimulatedVideo::control(int fd, unsigned long request, void* argument) {
   const Handle& handle = *handles_.at(fd);
   Device& device = *handle.device;
   if (!device.present) return -ENODEV;
+  if (const auto error = device.node.errors.find(request); error != device.node.errors.end()) return -error->second;
   switch (request) {
     case VIDIOC_QUERYCAP: {
       auto& capability = *static_cast<v4l2_capability*>(argument);
@@ -268,7 +270,11 @@ int SimulatedVideo::control(int fd, unsigned long request, void* argument) {
     case VIDIOC_ENUM_FRAMESIZES: return device.enumerate_size(*static_cast<v4l2_frmsizeenum*>(argument));
     case VIDIOC_ENUM_FRAMEINTERVALS: return device.enumerate_interval(*static_cast<v4l2_frmivalenum*>(argument));
     case VIDIOC_S_FMT: return device.set_format(static_cast<v4l2_format*>(argument)->fmt.pix);
-    case VIDIOC_S_PARM: return 0;
+    case VIDIOC_S_PARM:
+      if (device.node.keeps_rate != 0)
+        static_cast<v4l2_streamparm*>(argument)->parm.capture.timeperframe = {
+            1, static_cast<uint32_t>(device.node.keeps_rate)};
+      return 0;
     case VIDIOC_QUERY_EXT_CTRL: return device.query_control(*static_cast<v4l2_query_ext_ctrl*>(argument));
     case VIDIOC_QUERYMENU: {
       const auto& query = *static_cast<v4l2_querymenu*>(argument);
@@ -303,11 +309,11 @@ int SimulatedVideo::control(int fd, unsigned long request, void* argument) {
       char filled = 0;
       if (::read(fd, &filled, 1) != 1) return -EAGAIN;
       *static_cast<v4l2_buffer*>(argument) = device.filled.front();
+      static_cast<v4l2_buffer*>(argument)->index += device.node.fills_wrong_buffer;
       device.filled.pop_front();
       return 0;
     }
     case VIDIOC_STREAMON:
-      if (device.node.streamon_error != 0) return -device.node.streamon_error;
       if (device.node.forgets_on_stream) device.find(V4L2_CID_EXPOSURE_ABSOLUTE)->value = 250;
       device.sequence = 0;
       device.ready_fd = handle.ready_fd;
@@ -326,6 +332,7 @@ int SimulatedVideo::control(int fd, unsigned long request, void* argument) {
 
 const uint8_t* SimulatedVideo::map(int fd, size_t /*length*/, int64_t offset) {
   const std::lock_guard lock(mutex_);
+  if (!handles_.at(fd)->device->node.maps) return nullptr;
   return handles_.at(fd)->device->buffers[static_cast<size_t>(offset) / page].data();
 }
 

@@ -40,9 +40,13 @@ struct SimulatedNode {
   std::vector<SimulatedSize> sizes = {};
   std::vector<SimulatedControl> controls = {};
   bool monotonic = true;
-  int streamon_error = 0;          ///< errno of STREAMON
-  int rounds_width_to = 0;         ///< S_FMT does not keep the width that was asked for
-  bool forgets_on_stream = false;  ///< the exposure returns to its default when the stream begins
+  std::map<unsigned long, int> errors = {};  ///< errno of an ioctl that fails
+  uint32_t most_buffers = 32;                ///< that its driver grants
+  bool maps = true;                          ///< its buffers can be mapped
+  uint32_t fills_wrong_buffer = 0;           ///< added to the index of each that it fills
+  int keeps_rate = 0;                        ///< frames a second, whatever is asked for; 0: what is asked for
+  int rounds_width_to = 0;                   ///< S_FMT does not keep the width that was asked for
+  bool forgets_on_stream = false;            ///< the exposure returns to its default when the stream begins
 };
 
 /// Cameras as the kernel would show them, of which a test sends every frame. Descriptors are real ones, so that poll(2)

@@ -113,7 +113,8 @@ TEST_F(V4l2, DeliversNoDamagedFrame) {
   ASSERT_TRUE(system->send(node, jpeg(), clock.now(), V4L2_BUF_FLAG_ERROR));
   const auto damaged = camera->wait_frame(clock.now() + milliseconds(300));
   EXPECT_EQ(damaged.error().code, ErrorCode::invalid_file);
-  EXPECT_THAT(damaged.error().message, HasSubstr("body-00: frame 0 arrived damaged"));
+  EXPECT_EQ(damaged.error().message,
+            "body-00: frame 0 arrived damaged: it is no whole JPEG (" + std::to_string(cut.size()) + " bytes)");
   EXPECT_EQ(statistic(*camera, "n_damaged_frames"), 2);
 
   // Still armed; a whole frame beside a damaged one answers.
@@ -129,7 +130,8 @@ TEST_F(V4l2, DeliversNoJpegThatOnlyADecoderSeesIsDamaged) {
   const auto camera = armed(settings());
   camera->note_trigger(0, just_before());
   ASSERT_TRUE(system->send(node, jpeg(32, 16), clock.now()));
-  EXPECT_THAT(camera->wait_frame(soon()).error().message, HasSubstr("32x16 instead of 16x8"));
+  EXPECT_EQ(camera->wait_frame(soon()).error().message,
+            "body-00: frame 0 arrived damaged: it is 32x16 instead of 16x8");
   std::vector<uint8_t> cut = jpeg();  // its samples end too early, but the end marker is there
   cut.erase(cut.end() - 6, cut.end() - 2);
   camera->note_trigger(1, just_before());
@@ -143,8 +145,8 @@ TEST_F(V4l2, AShortRawFrameIsDamaged) {
   const auto camera = armed(grey);
   camera->note_trigger(0, just_before());
   ASSERT_TRUE(system->send(node, std::vector<uint8_t>(100), clock.now()));
-  EXPECT_THAT(camera->wait_frame(clock.now() + milliseconds(200)).error().message,
-              HasSubstr("it was cut off: 100 of 128 bytes"));
+  EXPECT_EQ(camera->wait_frame(clock.now() + milliseconds(200)).error().message,
+            "body-00: frame 0 arrived damaged: it was cut off: 100 of 128 bytes");
 }
 
 TEST_F(V4l2, GreyAndColourComeOutAsTheyAre) {
@@ -354,8 +356,7 @@ TEST_F(V4l2, FindsCamerasBySerialAndBusAndSkipsMetadata) {
 
   auto metadata_only = settings();
   metadata_only.device = "/dev/video1";
-  EXPECT_THAT(refusal(metadata_only, ErrorCode::unsupported),
-              HasSubstr("/dev/video1 is not a camera's picture stream"));
+  EXPECT_EQ(refusal(metadata_only, ErrorCode::unsupported), "body-00: /dev/video1 is not a camera's picture stream");
   system->plug_in(usual_camera("/dev/video3", "S2", "usb-sim-3"));
   EXPECT_THAT(refusal(by_serial), HasSubstr("several cameras have the serial number S2 (at usb-sim-2 and usb-sim-3); "
                                             "name the port with bus instead"));
@@ -365,21 +366,124 @@ TEST_F(V4l2, FindsCamerasBySerialAndBusAndSkipsMetadata) {
 
 TEST_F(V4l2, TranslatesWhyAStreamDoesNotBegin) {
   auto crowded = usual_camera();
-  crowded.streamon_error = ENOSPC;
+  crowded.errors = {{VIDIOC_STREAMON, ENOSPC}};
   system->plug_in(crowded);
   auto camera = open(settings());
   ASSERT_TRUE(camera);
-  EXPECT_THAT((*camera)->arm({}, 1).error().message, HasSubstr("not enough USB bandwidth"));
-  crowded.streamon_error = EBUSY;
+  EXPECT_EQ((*camera)->arm({}, 1).error().message,
+            "body-00: not enough USB bandwidth is left on its controller: use mjpg, a lower rate or size, or plug it "
+            "into another controller");
+  crowded.errors = {{VIDIOC_STREAMON, EBUSY}};
   camera = Error{};
   system->plug_in(crowded);
-  EXPECT_THAT((*open(settings()))->arm({}, 1).error().message, HasSubstr("another program uses it"));
+  EXPECT_EQ((*open(settings()))->arm({}, 1).error().message,
+            "body-00: does not begin to stream: another program uses it");
   auto unknown_time = usual_camera();
   unknown_time.monotonic = false;
   system->plug_in(unknown_time);
   const auto refused = (*open(settings()))->arm({}, 1);
   EXPECT_EQ(refused.error().code, ErrorCode::unsupported);
-  EXPECT_THAT(refused.error().message, HasSubstr("monotonic clock"));
+  EXPECT_EQ(refused.error().message,
+            "body-00: its driver does not stamp frames with the monotonic clock, so that their time is unknown");
+}
+
+TEST_F(V4l2, SaysWhatFailsWhenItIsOpened) {
+  struct Case {
+    unsigned long request;
+    int error;
+    ErrorCode code;
+    const char* message;
+  };
+  const Case cases[] = {
+      {VIDIOC_QUERYCAP, EIO, ErrorCode::device_lost,
+       "body-00: /dev/video0: cannot be asked what it is: it does not answer (Input/output error)"},
+      {VIDIOC_S_FMT, EBUSY, ErrorCode::busy, "body-00: its format cannot be set: another program uses it"},
+      {VIDIOC_S_PARM, ENODEV, ErrorCode::device_lost, "body-00: its frame rate cannot be set: it is not plugged in"},
+      {VIDIOC_S_PARM, EINVAL, ErrorCode::invalid_argument, "body-00: fps 30 is not possible"},
+      {VIDIOC_S_EXT_CTRLS, EIO, ErrorCode::device_lost,
+       "body-00: its gain cannot be set: it does not answer (Input/output error)"},
+      {VIDIOC_S_EXT_CTRLS, ERANGE, ErrorCode::invalid_argument,
+       "body-00: gain is 40, which the camera refuses; it says it takes 0 … 100"},
+      {VIDIOC_S_EXT_CTRLS, EACCES, ErrorCode::invalid_argument,
+       "body-00: gain is 40, which the camera refuses while one of its automatics governs it, or as it is read-only"},
+      {VIDIOC_G_EXT_CTRLS, EPIPE, ErrorCode::device_lost,
+       "body-00: its gain cannot be read: it does not answer (Broken pipe)"}};
+  auto asked = settings();
+  asked.fps = 30;
+  asked.gain = 40;
+  for (const Case& one : cases) {
+    auto failing = usual_camera();
+    failing.errors = {{one.request, one.error}};
+    system->plug_in(failing);
+    EXPECT_EQ(refusal(asked, one.code), one.message);
+  }
+  auto stubborn = usual_camera();
+  stubborn.keeps_rate = 15;
+  system->plug_in(stubborn);
+  EXPECT_EQ(refusal(asked), "body-00: fps 30 is not possible; this camera would take 15");
+}
+
+TEST_F(V4l2, SaysWhyItHasNoBuffers) {
+  const auto expect = [&](const SimulatedNode& failing, ErrorCode code, const std::string& message) {
+    system->plug_in(failing);
+    const auto camera = open(settings());
+    ASSERT_TRUE(camera) << camera.error().message;
+    const auto refused = (*camera)->arm({}, 1);
+    ASSERT_FALSE(refused) << message;
+    EXPECT_EQ(refused.error().code, code) << message;
+    EXPECT_EQ(refused.error().message, message);
+    EXPECT_FALSE(system->streams(node));
+  };
+  auto poor = usual_camera();
+  poor.most_buffers = 1;
+  expect(poor, ErrorCode::io, "body-00: the kernel has memory for 1 buffers only");
+  auto unmappable = usual_camera();
+  unmappable.maps = false;
+  expect(unmappable, ErrorCode::io, "body-00: its buffers cannot be mapped");
+  auto failing = usual_camera();
+  failing.errors = {{VIDIOC_REQBUFS, EBUSY}};
+  expect(failing, ErrorCode::busy, "body-00: lends no buffers: another program uses it");
+  failing.errors = {{VIDIOC_REQBUFS, ENOMEM}};
+  expect(failing, ErrorCode::io, "body-00: lends no buffers: Cannot allocate memory");
+  failing.errors = {{VIDIOC_QUERYBUF, EINVAL}};
+  expect(failing, ErrorCode::io, "body-00: does not tell of its buffers: Invalid argument");
+  failing.errors = {{VIDIOC_QBUF, EIO}};
+  expect(failing, ErrorCode::device_lost, "body-00: takes no buffers: it does not answer (Input/output error)");
+}
+
+TEST_F(V4l2, SaysHowAStreamEnded) {
+  auto confused = usual_camera();
+  confused.fills_wrong_buffer = 100;
+  system->plug_in(confused);
+  auto camera = armed(settings());
+  ASSERT_TRUE(system->send(node, jpeg(), clock.now()));
+  EXPECT_EQ(camera->wait_frame(soon()).error().message, "body-00: its driver delivers buffers that it never got");
+  camera.reset();
+  system->plug_in(usual_camera());
+  camera = armed(settings());
+  system->unplug(node);
+  EXPECT_EQ(camera->wait_frame(soon()).error().message, "body-00: was unplugged");
+  camera.reset();
+  system->plug_in(usual_camera());
+  camera = armed(settings());
+  const auto silent = camera->wait_frame(soon());
+  EXPECT_EQ(silent.error().code, ErrorCode::device_lost);
+  EXPECT_EQ(silent.error().message, "body-00: has delivered no frame for 5 s");
+}
+
+TEST_F(V4l2, SaysWhatAFrameThatIsNotThereWantsFor) {
+  auto near = settings();
+  near.max_offset_ms = 20;
+  const auto camera = armed(near);
+  EXPECT_EQ(camera->wait_frame(clock.now()).error().message, "body-00: delivered no frame in time");
+  const Timestamp triggered = clock.now();
+  camera->note_trigger(0, triggered);
+  ASSERT_TRUE(system->send(node, jpeg(), triggered + milliseconds(500)));
+  EXPECT_EQ(camera->wait_frame(soon()).error().message,
+            "body-00: frame 0 is missing: none was exposed within 20 ms of its trigger");
+  camera->stop();
+  EXPECT_EQ(camera->wait_frame(soon()).error().message, "body-00: was stopped");
+  EXPECT_EQ(camera->arm({}, 0).error().message, "body-00: cannot be armed for 0");
 }
 
 TEST_F(V4l2, SaysWhatTheSystemsRefusalsMean) {
@@ -427,6 +531,7 @@ TEST_F(V4l2, ACameraIsOpenedOnceAndOnlyWhereItIsConfigured) {
   EXPECT_EQ(cameras->open_camera("other").error().message,
             "other: no camera of that name is configured for the driver v4l2");
   EXPECT_EQ(cameras->open_trigger().error().message, "v4l2: USB cameras have no trigger");
+  EXPECT_EQ(cameras->open_projector().error().message, "v4l2: a camera is no projector");
 }
 
 /// Nobody noted the instant of the second one: its frame answers nothing, and the third one's is not taken for it.
@@ -457,7 +562,7 @@ TEST_F(V4l2, ABrokenStreamLosesTheCamera) {
   system->break_stream(node);
   const auto waited = camera->wait_frame(soon());
   EXPECT_EQ(waited.error().code, ErrorCode::device_lost);
-  EXPECT_THAT(waited.error().message, HasSubstr("body-00: its stream broke off"));
+  EXPECT_EQ(waited.error().message, "body-00: its stream broke off: Input/output error");
   EXPECT_EQ(camera->check_presence().error().code, ErrorCode::device_lost);
 }
 
@@ -548,7 +653,7 @@ TEST_F(V4l2, ACameraWithALineOfItsOwnHasNoPreviewAndIsNotWaitedFor) {
   ASSERT_TRUE(camera);
   const auto preview = (*camera)->arm({.mode = CaptureMode::preview}, 1);
   EXPECT_EQ(preview.error().code, ErrorCode::unsupported);
-  EXPECT_THAT(preview.error().message, HasSubstr("has no preview: it exposes only when its line is pulsed"));
+  EXPECT_EQ(preview.error().message, "body-00: has no preview: it exposes only when its line is pulsed");
   EXPECT_TRUE((*camera)->arm({}, 1)) << "though no frame comes";
 }
 

@@ -508,6 +508,8 @@ class GigeCamera::Device {
 
   bool write_checked(uint32_t address, uint32_t value) {
     if (address + 4 > memory_size || address % 4 != 0) return false;
+    for (const Feature& feature : reported_features)
+      if (feature.name == options_.keeps && feature.address == address) return true;
     if (address == stream_packet_size && (value & fire_test_packet) != 0) {
       value &= ~fire_test_packet;
       const uint32_t size = value & 0xffff;

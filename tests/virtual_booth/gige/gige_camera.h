@@ -30,6 +30,7 @@ struct GigeCameraOptions {
   bool shares_clock = false;                ///< it shows this machine's time, as all cameras that follow one PTP master
   bool offers_ptp = true;
   std::string lacks = {};  ///< a feature of the description that it has not
+  std::string keeps = {};  ///< a feature, as feature() knows it, that is written without effect
   double largest_exposure_us = 1'000'000;
 };
 
