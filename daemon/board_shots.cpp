@@ -25,20 +25,24 @@ std::optional<int> board_index(const std::string& shot) {
 }  // namespace
 
 Result<std::vector<BoardView>> find_boards(const Recording& recording, const Shot& shot, int first_pose,
-                                           std::vector<std::string>& messages, const Work& work) {
+                                           std::vector<std::string>& messages, const Work& work,
+                                           std::vector<WhiteSample>* whites) {
   LoadedShot loaded = load_shot(recording, shot, work);
   messages.insert(messages.end(), loaded.faults.begin(), loaded.faults.end());
   std::vector<const Frame*> frames;
   for (const FrameSet& set : loaded.sets)
     for (const Frame& frame : set.frames) frames.push_back(&frame);
   std::vector<std::optional<Result<BoardView>>> found(frames.size());
+  std::vector<std::vector<WhiteSample>> white(frames.size());
   work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end && !work.stopped(); ++i) {
       const auto frame = develop(*frames[i]);
-      if (frame)
-        found[i] = find_board(frame->camera, first_pose + frame->index, *frame->pixels, *shot.board);
-      else
+      if (!frame) {
         found[i] = frame.error();
+        continue;
+      }
+      found[i] = find_board(frame->camera, first_pose + frame->index, *frame->pixels, *shot.board);
+      if (whites != nullptr && found[i]->ok()) white[i] = sample_whites(**found[i], *frame->pixels, *shot.board);
     }
   });
   if (work.stopped()) return Work::cancelled();
@@ -47,6 +51,8 @@ Result<std::vector<BoardView>> find_boards(const Recording& recording, const Sho
     if (!*view) return view->error();
     views.push_back(std::move(**view));
   }
+  if (whites != nullptr)
+    for (const auto& samples : white) whites->insert(whites->end(), samples.begin(), samples.end());
   return views;
 }
 

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "pipeline/calibration/board_view.h"
+#include "pipeline/calibration/colour_response.h"
 #include "pipeline/types/result.h"
 #include "pipeline/types/work.h"
 #include "replay/recording.h"
@@ -14,10 +15,12 @@ namespace booth {
 ///
 /// @param first_pose  the pose of the shot's index 0; the others count on
 /// @param messages    is added a sentence for each picture that cannot be used
+/// @param whites      is added what the pictures show of the board's white; null: nobody asks
 /// @error as find_board; cancelled
 /// @pre shot.board is there
 Result<std::vector<BoardView>> find_boards(const Recording& recording, const Shot& shot, int first_pose,
-                                           std::vector<std::string>& messages, const Work& work);
+                                           std::vector<std::string>& messages, const Work& work,
+                                           std::vector<WhiteSample>* whites = nullptr);
 
 /// What the projector lit of the boards: of each Gray-code shot named "board-N", taken of the board resting as in index
 /// N, the projector's view by the camera that decoded most corners.

@@ -77,7 +77,7 @@ Result<Gathered> gather(const OfflineCalibrationOptions& options, const Work& wo
         input.board = *shot.board;
       else if (!same_board(input.board, *shot.board))
         return Error{ErrorCode::invalid_argument, folder.string() + ": shot " + shot.name + " shows another board"};
-      auto views = find_boards(*recording, shot, next_pose, gathered.messages, work);
+      auto views = find_boards(*recording, shot, next_pose, gathered.messages, work, &input.whites);
       if (!views) return views.error();
       if (recording->rig.projector && first_shot) {
         auto lit = projector_views(*recording, *views, next_pose, gathered.messages, work);
@@ -166,6 +166,16 @@ std::string figures_json(const Calibration& calibration, const CalibrationInput&
                                {"wants", seen.wants.empty() ? Json(nullptr) : Json(seen.wants)},
                                {"messages", device.messages}});
   }
+  json["colours"] = {
+      {"before", calibration.colours.before}, {"after", calibration.colours.after}, {"cameras", Json::array()}};
+  for (const CameraColour& camera : calibration.colours.cameras)
+    json["colours"]["cameras"].push_back({{"id", camera.id},
+                                          {"gain", {camera.gain[0], camera.gain[1], camera.gain[2]}},
+                                          {"matched", camera.matched},
+                                          {"samples", camera.samples},
+                                          {"clipped", camera.clipped},
+                                          {"before", camera.before},
+                                          {"after", camera.after}});
   return json.dump(1) + "\n";
 }
 

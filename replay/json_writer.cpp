@@ -36,6 +36,7 @@ Json camera_json(const RigCamera& camera) {
   json["height"] = camera.intrinsics.height;
   json["mount_rotation_deg"] = camera.mount_rotation_deg;
   add_calibration(json, camera);
+  if ((camera.colour_gain != 1).any()) json["colour_gain"] = vector_json(camera.colour_gain.matrix().cast<double>());
   if (camera.rms_px) json["rms_px"] = *camera.rms_px;
   if (camera.uncertainty)
     json["uncertainty"] = {{"center_m", camera.uncertainty->center_m},

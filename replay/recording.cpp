@@ -95,6 +95,10 @@ RigCamera read_camera(const JsonField& field, CameraRole role) {
     camera.mount_rotation_deg = read_int(*turn, 0, 270);
     if (camera.mount_rotation_deg % 90 != 0) turn->refuse_value("0, 90, 180 or 270");
   }
+  if (const auto gain = field.find("colour_gain"); gain && gain->expect_elements(3, "3 numbers: red, green, blue"))
+    for (size_t c = 0; c < 3; ++c)
+      camera.colour_gain[static_cast<Eigen::Index>(c)] =
+          static_cast<float>((*gain)[c].number(least_colour_gain, most_colour_gain));
   constexpr double largest_rms_px = 1e6;
   if (const auto rms = field.find("rms_px")) camera.rms_px = rms->number(0, largest_rms_px);
   constexpr double largest_uncertainty = 1e6;

@@ -184,16 +184,19 @@ void inpaint_rim(Image& colours, Image& valid) {
   grown.copyTo(known);
 }
 
-LightPyramid linear_light(const Pyramid& pyramid) {
-  std::array<uint16_t, 256> table{};
-  for (size_t i = 0; i < table.size(); ++i)
-    table[i] = static_cast<uint16_t>(std::lround(full_light * linear_light_of_srgb[i]));
+LightPyramid linear_light(const Pyramid& pyramid, const Eigen::Array3f& colour_gain) {
+  constexpr float brightest = 65535;
+  std::array<std::array<uint16_t, 256>, 3> tables{};
+  for (size_t c = 0; c < 3; ++c)
+    for (size_t i = 0; i < tables[c].size(); ++i)
+      tables[c][i] = static_cast<uint16_t>(std::lround(
+          std::min(brightest, colour_gain[static_cast<Eigen::Index>(c)] * full_light * linear_light_of_srgb[i])));
   LightPyramid light;
   for (const Image& level : pyramid) {
     LightImage& linear = light.emplace_back(level.width, level.height, 4);
     const size_t pixels = level.samples.size() / 3;
     for (size_t i = 0; i < pixels; ++i)
-      for (size_t c = 0; c < 3; ++c) linear.samples[4 * i + c] = table[level.samples[3 * i + c]];
+      for (size_t c = 0; c < 3; ++c) linear.samples[4 * i + c] = tables[c][level.samples[3 * i + c]];
   }
   return light;
 }
@@ -231,7 +234,7 @@ PreparedView prepare_view(const Mesh& mesh, const RigCamera& camera, const Frame
   for (int y = 0; y < valid.height; ++y)
     for (int x = 0; x < valid.width; ++x) valid.at(x, y) = inside.at(x / 2, y / 2);
   if (inpainting == Inpainting::telea) inpaint_rim(colours, valid);
-  view.colours = linear_light(push_pull(std::move(colours), valid));
+  view.colours = linear_light(push_pull(std::move(colours), valid), camera.colour_gain);
   return view;
 }
 

@@ -32,9 +32,10 @@ struct PreparedView {
   /// Of each vertex: pixel x and y, and the depth along the optical axis in metres; a depth of 0 says that the
   /// camera cannot see it (behind it, or too far off the axis).
   std::vector<Eigen::Vector3f> projected;
-  LightPyramid colours;  ///< the rim and the outside of the subject hold colours of its inside
-  FloatImage depth;      ///< metres to the first surface, at half the resolution (level 1 of the pyramid); huge = none
-  Image confidence;      ///< like `depth`: 255 well inside, falling to 0 at outlines, depth steps and image borders
+  LightPyramid
+      colours;  ///< times the camera's colour_gain; the rim and the outside of the subject hold colours of its inside
+  FloatImage depth;  ///< metres to the first surface, at half the resolution (level 1 of the pyramid); huge = none
+  Image confidence;  ///< like `depth`: 255 well inside, falling to 0 at outlines, depth steps and image borders
   Raster<uint16_t> margin;  ///< like `depth`: how far the silhouette's outline is, thirds of a pixel of this map
   int left = 0, top = 0;    ///< of the crop in the image
 };

@@ -660,11 +660,18 @@ Result<Calibration> solve_calibration(const CalibrationInput& input, const Calib
         camera.uncertainty = quality.pose;
       }
   judge(solved, placement, options, solved.verdict, solved.reason);
+  if (!input.whites.empty()) {
+    std::vector<std::string> cameras;
+    for (const RigCamera& camera : solved.rig.cameras) cameras.push_back(camera.id);
+    solved.colours = match_colours(cameras, input.whites);
+    for (size_t i = 0; i < cameras.size(); ++i) solved.rig.cameras[i].colour_gain = solved.colours.cameras[i].gain;
+  }
 
   solved.messages = placement.messages;
   for (const DeviceQuality& quality : solved.devices)
     solved.messages.insert(solved.messages.end(), quality.messages.begin(), quality.messages.end());
   if (const std::string blurred = about_blurred(input); !blurred.empty()) solved.messages.push_back(blurred);
+  solved.messages.insert(solved.messages.end(), solved.colours.messages.begin(), solved.colours.messages.end());
   work.report(1);
   return solved;
 }

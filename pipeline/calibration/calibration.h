@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "pipeline/calibration/board_view.h"
+#include "pipeline/calibration/colour_response.h"
 #include "pipeline/types/result.h"
 #include "pipeline/types/rig.h"
 #include "pipeline/types/shot.h"
@@ -30,9 +31,10 @@ std::vector<CalibrationDevice> calibration_devices(const Rig& rig);
 struct CalibrationInput {
   std::vector<CalibrationDevice> devices;
   CalibrationBoard board;
-  std::vector<BoardView> views;   ///< of the devices, in any order; at most one a device and pose
-  std::optional<int> floor_pose;  ///< the pose of the board laid on the floor: it gives the world frame
-  std::optional<Rig> previous;    ///< the world frame otherwise, the volume, and the scale to compare with
+  std::vector<BoardView> views;     ///< of the devices, in any order; at most one a device and pose
+  std::vector<WhiteSample> whites;  ///< of the cameras' pictures of the board; none: colours are not matched
+  std::optional<int> floor_pose;    ///< the pose of the board laid on the floor: it gives the world frame
+  std::optional<Rig> previous;      ///< the world frame otherwise, the volume, and the scale to compare with
 };
 
 struct CalibrationOptions {
@@ -73,7 +75,8 @@ struct DeviceQuality {
 };
 
 struct Calibration {
-  Rig rig;  ///< the solved devices; world frame as in rig.json
+  Rig rig;                 ///< the solved devices; world frame as in rig.json
+  ColourResponse colours;  ///< of the solved cameras; without any where there were no whites
   CalibrationVerdict verdict = CalibrationVerdict::bad;
   std::string reason;                               ///< of the verdict, a sentence
   std::vector<DeviceQuality> devices;               ///< in the order of the input's
@@ -93,6 +96,9 @@ struct Calibration {
 ///
 /// World frame: of floor_pose (origin at the board's centre, +Y out of its face, +Z towards its bottom edge), otherwise
 /// that in which the previous rig's cameras lie closest, otherwise that of the first pose. The scale is the board's.
+///
+/// The solved cameras' colours are matched by the board's white, which does not change the verdict: see
+/// match_colours.
 ///
 /// A device that cannot be solved is left out of the rig and says why in its DeviceQuality; verdict is then bad.
 /// @error invalid_argument  a board or device that is not valid, a view of an unknown device or with wrong corners

@@ -188,6 +188,26 @@ figcaption{font-size:13px;color:#555}svg text{font:10px sans-serif;fill:#333}.pi
 .board{fill:#d8c98a66;stroke:#8a7320;stroke-width:.8}.scale{stroke:#222;stroke-width:2}
 )";
 
+/// How the cameras' colours were matched; nothing where they were not.
+std::string colour_table(const ColourResponse& colours) {
+  if (colours.cameras.empty()) return "";
+  const auto percent = [](double share) { return decimal(100 * share, 2); };
+  std::string table =
+      "<h2>Colours</h2>\n<p>How far the cameras disagree about the board's white: " + percent(colours.before) +
+      " % before and " + percent(colours.after) +
+      " % after (root mean square) each picture is multiplied by its camera's factors, in linear "
+      "light.</p>\n<table><tr><th>camera<th>red<th>green<th>blue<th>white squares<th>overexposed<th>before "
+      "(%)<th>after (%)</tr>\n";
+  for (const CameraColour& camera : colours.cameras) {
+    table += "<tr><td>" + escaped(camera.id);
+    for (const float gain : camera.gain)
+      table += "<td>" + (camera.matched ? decimal(static_cast<double>(gain), 4) : std::string("not matched"));
+    table += "<td>" + std::to_string(camera.samples) + "<td>" + std::to_string(camera.clipped) + "<td>" +
+             (camera.matched ? percent(camera.before) + "<td>" + percent(camera.after) : "<td>") + "</tr>\n";
+  }
+  return table + "</table>\n";
+}
+
 }  // namespace
 
 std::string calibration_report_html(const Calibration& calibration, const CalibrationInput& input) {
@@ -222,7 +242,7 @@ std::string calibration_report_html(const Calibration& calibration, const Calibr
             decimal(quality.focal_sigma_px, 2) + "<td>" +
             (view ? decimal(100 * seen_of_volume(*view, calibration.rig.volume), 0) + " %" : "") + "</tr>\n";
   }
-  page += "</table>\n<h2>The rig</h2>\n";
+  page += "</table>\n" + colour_table(calibration.colours) + "<h2>The rig</h2>\n";
   page += rig_view(calibration, input,
                    {0, 2, 1, 1, "from above: the subject stands in the green volume and looks down the page"});
   page += rig_view(calibration, input, {2, 1, 1, -1, "from the side: the subject looks to the right"});

@@ -50,6 +50,10 @@ Result<void> check(const Rig& rig) {
     const int turn = camera.mount_rotation_deg;
     if (turn != 0 && turn != 90 && turn != 180 && turn != 270)
       return invalid(owner, "mount_rotation_deg must be 0, 90, 180 or 270");
+    // Compared as floats: the least one is no binary number.
+    if (!(camera.colour_gain >= static_cast<float>(least_colour_gain)).all() ||
+        !(camera.colour_gain <= static_cast<float>(most_colour_gain)).all())
+      return invalid(owner, "colour_gain must hold 3 numbers within 0.1 … 10");
   }
   if (rig.projector) return check_view(*rig.projector, "projector");
   return {};

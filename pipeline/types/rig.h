@@ -37,10 +37,16 @@ struct PoseUncertainty {
   double rotation_rad = 0;  ///< about its least certain axis
 };
 
+constexpr double least_colour_gain = 0.1;
+constexpr double most_colour_gain = 10;
+
 struct RigCamera : CalibratedView {
   CameraRole role = CameraRole::body;
-  int mount_rotation_deg = 0;    ///< turning the stored image clockwise by it makes it upright: 0, 90, 180, 270
-  std::optional<double> rms_px;  ///< reprojection error of its calibration
+  int mount_rotation_deg = 0;  ///< turning the stored image clockwise by it makes it upright: 0, 90, 180, 270
+  /// Factors in linear light, red, green, blue, that make this camera's pictures agree with the others'; each within
+  /// least_colour_gain … most_colour_gain.
+  Eigen::Array3f colour_gain{1, 1, 1};
+  std::optional<double> rms_px;                ///< reprojection error of its calibration
   std::optional<PoseUncertainty> uncertainty;  ///< of its calibration
 };
 
@@ -57,7 +63,7 @@ struct Rig {
 };
 
 /// Ids unique and file-name safe, sizes and focal lengths positive, rotations orthonormal, everything finite,
-/// volume not empty. The message names the camera and the field.
+/// colour gains in their range, volume not empty. The message names the camera and the field.
 Result<void> check(const Rig& rig);
 
 /// Letters, digits, '-', '_' and '.', at most 64 of them, not starting with '.': safe as a file name and in a topic.

@@ -14,6 +14,7 @@
 #include <utility>
 #include <vector>
 
+#include "pipeline/atlas/linear_light.h"
 #include "pipeline/geometry/camera_model.h"
 #include "pipeline/surface/marching_cubes.h"
 #include "pipeline/thread_pool.h"
@@ -190,6 +191,35 @@ TEST_F(TextureAtlasOfAPerson, HasTheirColoursByTheMethodsOfReferenceToo) {
     EXPECT_LT(mean_error(scene_->mesh, result.atlas, synthetic::colour_at), 5.0) << to_string(method);
     EXPECT_EQ(result.positions, scene_->mesh.positions) << to_string(method);
   }
+}
+
+TEST_F(TextureAtlasOfAPerson, IsOfOneColourWhereTheCamerasGainsAreKnown) {
+  const Eigen::Array3f light(0.3F, 0.22F, 0.14F);
+  Scene scene = *scene_;
+  for (size_t c = 0; c < scene.frames.size(); ++c) {
+    const float turn = static_cast<float>(c);
+    const Eigen::Array3f gain(0.8F + 0.09F * turn, 1.25F - 0.08F * turn, c % 2 == 0 ? 0.85F : 1.2F);
+    auto image = std::make_shared<Image>(*scene.frames[c].pixels);
+    for (int y = 0; y < image->height; ++y)
+      for (int x = 0; x < image->width; ++x)
+        for (int k = 0; k < 3; ++k) image->at(x, y, k) = srgb_from_linear(light[k] / gain[k]);
+    scene.frames[c].pixels = std::move(image);
+    scene.rig.cameras[c].colour_gain = gain;
+  }
+  AtlasOptions options = small;
+  options.balance_colours = false;
+  const auto worst_error_of = [&](const Scene& seen) {
+    double worst = 0;
+    for (const Sample& sample : middles(seen.mesh, textured(seen, options).atlas))
+      for (int k = 0; k < 3; ++k) worst = std::max(worst, std::abs(sample.colour[k] - srgb_from_linear(light[k])));
+    return worst;
+  };
+  for (const TextureMethod method : {TextureMethod::full, TextureMethod::best_view}) {
+    options.method = method;
+    EXPECT_LE(worst_error_of(scene), 1.0) << to_string(method) << ": what rounding leaves";
+  }
+  for (RigCamera& camera : scene.rig.cameras) camera.colour_gain.setOnes();
+  EXPECT_GT(worst_error_of(scene), 10.0);
 }
 
 TEST_F(TextureAtlasOfAPerson, IsTheSameOnAnyNumberOfThreads) {

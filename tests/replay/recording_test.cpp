@@ -221,6 +221,12 @@ TEST_F(ChangedRecording, SaysWhichFieldIsWrong) {
       {"rig.json", "\"width\": 480", "\"width\": 100000", "rig.json: cameras[0].width: 100000, expected"},
       {"rig.json", "\"mount_rotation_deg\": 0", "\"mount_rotation_deg\": 45",
        "rig.json: cameras[0].mount_rotation_deg"},
+      {"rig.json", "\"mount_rotation_deg\": 0", "\"colour_gain\": [1, 20, 1], \"mount_rotation_deg\": 0",
+       "rig.json: cameras[0].colour_gain[1]: 20, expected a number from 0.1 to 10"},
+      {"rig.json", "\"mount_rotation_deg\": 0", "\"colour_gain\": [-1, 1, 1], \"mount_rotation_deg\": 0",
+       "rig.json: cameras[0].colour_gain[0]: -1, expected a number from 0.1 to 10"},
+      {"rig.json", "\"mount_rotation_deg\": 0", "\"colour_gain\": 1.1, \"mount_rotation_deg\": 0",
+       "rig.json: cameras[0].colour_gain: "},
       {"rig.json", "0.9999495612021441", "0.5", "rig.json: cameras[0].R: is not a rotation"},
       {"rig.json", "-0.04944543151981713", "null", "rig.json: cameras[0].distortion[0]: null, expected a number"},
       {"rig.json", "\"distortion\": [", "\"distortion\": [0,", "rig.json: cameras[0].distortion: expected the 5 numb"},
@@ -293,6 +299,7 @@ TEST(WriteRigJson, GivesEveryNumberBack) {
   written.cameras[2].rms_px.reset();
   written.cameras[1].uncertainty = PoseUncertainty{.center_m = 0.0004, .rotation_rad = 0.00017};
   written.cameras[2].intrinsics.skew = 1.0 / 3.0;
+  written.cameras[2].colour_gain = {0.1F, 1.0F / 3, 10.0F};
   const ScratchFolder scratch;
   ASSERT_TRUE(write_file_atomically(scratch.path() / "rig.json", write_rig_json(written)));
   const auto read = read_rig(scratch.path() / "rig.json");
@@ -315,6 +322,7 @@ TEST(WriteRigJson, GivesEveryNumberBack) {
     EXPECT_EQ(read->cameras[i].role, written.cameras[i].role);
     EXPECT_EQ(read->cameras[i].mount_rotation_deg, written.cameras[i].mount_rotation_deg);
     EXPECT_EQ(read->cameras[i].rms_px, written.cameras[i].rms_px);
+    EXPECT_TRUE((read->cameras[i].colour_gain == written.cameras[i].colour_gain).all());
     ASSERT_EQ(read->cameras[i].uncertainty.has_value(), written.cameras[i].uncertainty.has_value());
     if (!written.cameras[i].uncertainty) continue;
     EXPECT_EQ(read->cameras[i].uncertainty->center_m, written.cameras[i].uncertainty->center_m);
