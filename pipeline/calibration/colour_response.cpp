@@ -200,7 +200,7 @@ std::vector<size_t> largest_group(const std::vector<Observation>& observations, 
   return largest == members.end() ? std::vector<size_t>() : *largest;
 }
 
-/// Grey cameras: one response for all channels. The mean response of the others, or else of all, becomes 0.
+/// Makes 0 the mean response of the colour cameras, or where all are grey, of all.
 void normalise(const std::vector<bool>& grey, Eigen::MatrixX3d& responses) {
   const bool all_grey = std::find(grey.begin(), grey.end(), false) == grey.end();
   Eigen::RowVector3d mean = Eigen::RowVector3d::Zero();
@@ -211,9 +211,14 @@ void normalise(const std::vector<bool>& grey, Eigen::MatrixX3d& responses) {
     ++count;
   }
   responses.rowwise() -= mean / count;
-  for (size_t i = 0; i < grey.size(); ++i)
-    if (const auto row = static_cast<Eigen::Index>(i); grey[i])
-      responses.row(row).setConstant(responses.row(row).mean());
+}
+
+/// How a grey camera's response differs between the channels: it cannot tell the paper's tint. Otherwise 0.
+Eigen::MatrixX3d unseen_tint(const std::vector<bool>& grey, const Eigen::MatrixX3d& responses) {
+  Eigen::MatrixX3d tint = Eigen::MatrixX3d::Zero(responses.rows(), 3);
+  for (Eigen::Index row = 0; row < responses.rows(); ++row)
+    if (grey[static_cast<size_t>(row)]) tint.row(row) = responses.row(row).array() - responses.row(row).mean();
+  return tint;
 }
 
 }  // namespace
@@ -337,9 +342,11 @@ ColourResponse match_colours(std::span<const std::string> cameras, std::span<con
     Solution solution = robust_solution(observations, group.size(), places);
     normalise(grey_within, solution.responses);
 
+    // That grey cameras tell no colours is no disagreement.
+    const Eigen::MatrixX3d tint = unseen_tint(grey_within, solution.responses);
     const auto after = residuals_of(observations, places, solution.weights, solution.responses);
-    const auto before =
-        residuals_of(observations, places, solution.weights, Eigen::MatrixX3d::Zero(solution.responses.rows(), 3));
+    const auto before = residuals_of(observations, places, solution.weights, tint);
+    solution.responses -= tint;
     std::vector<double> weight(group.size(), 0);
     double all = 0;
     for (size_t i = 0; i < observations.size(); ++i) {

@@ -24,12 +24,17 @@ using testing::HasSubstr;
 using testing::IsEmpty;
 using testing::StartsWith;
 
-CalibrationBoard wide_ringed_board() {
-  CalibrationBoard board = synthetic::small_board();
-  board.marker_m = 0.06;
-  return board;
+const CalibrationBoard board = synthetic::small_board();
+
+/// Cameras of enough pixels that the white around the markers is wider than the blur.
+Rig fine_rig() {
+  Rig rig = synthetic::arc_rig();
+  for (RigCamera& camera : rig.cameras) {
+    Intrinsics& k = camera.intrinsics;
+    k.width *= 2, k.height *= 2, k.fx *= 2, k.fy *= 2, k.cx *= 2, k.cy *= 2;
+  }
+  return rig;
 }
-const CalibrationBoard board = wide_ringed_board();
 
 uint8_t value_of(double light, double noise) {
   const double l = std::clamp(light, 0.0, 1.0);
@@ -49,20 +54,33 @@ Image photograph(const RigCamera& camera, const Eigen::Isometry3d& world_from_bo
   const Eigen::Vector3d eye = board_from_camera.translation();
   std::mt19937 random(seed);
   std::normal_distribution<double> noise(0, 1.5);
+  constexpr double margin_m = 0.02;
+  Eigen::AlignedBox2d box;  // of the board in the picture
+  for (const double x : {-margin_m, pattern.width_m() + margin_m})
+    for (const double y : {-margin_m, pattern.height_m() + margin_m})
+      box.extend(project(camera, world_from_board * Eigen::Vector3d(x, y, 0)).value());
+  box = Eigen::AlignedBox2d(box.min().array() - footprint_px, box.max().array() + footprint_px);
+  const double wall = 0.2 * brightness;
   Image image(camera.intrinsics.width, camera.intrinsics.height, 3);
+  for (int c = 0; c < 3; ++c) {
+    const uint8_t wall_value = value_of(wall * paper[c] * response[c], 0);
+    for (int y = 0; y < image.height; ++y)
+      for (int x = 0; x < image.width; ++x)
+        image.at(x, y, c) = static_cast<uint8_t>(std::lround(wall_value + noise(random)));
+  }
   for (int y = 0; y < image.height; ++y)
     for (int x = 0; x < image.width; ++x) {
+      if (!box.contains(Eigen::Vector2d(x, y))) continue;
       double light = 0;
       for (int s = 0; s < samples * samples; ++s) {
         const Eigen::Vector2d offset((s % samples + 0.5) / samples - 0.5, (s / samples + 0.5) / samples - 0.5);
         const Eigen::Vector2d pixel = Eigen::Vector2d(x, y) + footprint_px * offset;
         const Eigen::Vector3d ray = board_from_camera.linear() * unproject(camera.intrinsics, pixel);
         const Eigen::Vector3d p = eye - eye.z() / ray.z() * ray;
-        constexpr double margin_m = 0.02;
-        const bool on_board = eye.z() < 0 && p.x() > -margin_m && p.y() > -margin_m &&
-                              p.x() < pattern.width_m() + margin_m && p.y() < pattern.height_m() + margin_m;
+        const bool on_board = p.x() > -margin_m && p.y() > -margin_m && p.x() < pattern.width_m() + margin_m &&
+                              p.y() < pattern.height_m() + margin_m;
         const double shade = brightness * (1 + 0.5 * p.x() / pattern.width_m());
-        light += !on_board ? 0.2 * brightness : (pattern.white(p.x(), p.y()) ? 1.0 : 0.04) * shade;
+        light += !on_board ? wall : (pattern.white(p.x(), p.y()) ? 1.0 : 0.04) * shade;
       }
       for (int c = 0; c < 3; ++c)
         image.at(x, y, c) = value_of(light / (samples * samples) * paper[c] * response[c], noise(random));
@@ -108,7 +126,7 @@ class MatchedColours : public testing::Test {
   }
 
   static const Rig& rig() {
-    static const Rig made = synthetic::arc_rig();
+    static const Rig made = fine_rig();
     return made;
   }
   /// What the sensors make of light.
@@ -256,7 +274,7 @@ TEST_F(MatchedColours, GoesIntoTheRigAndTheReport) {
 }
 
 TEST(SampleWhites, TakesNothingThatTheBlackReaches) {
-  const Rig rig = synthetic::arc_rig();
+  const Rig rig = fine_rig();
   const Image image = photograph(rig.cameras[1], synthetic::tilted_places(board, 1)[0], {1, 1, 1}, 0.4, 3);
   auto view = find_board("b1", 0, image, board);
   ASSERT_TRUE(view);
