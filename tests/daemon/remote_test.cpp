@@ -333,6 +333,9 @@ TEST_F(Remote, AnswersWhileStrangersKnock) {
 }
 
 TEST_F(Remote, WhoAsksTooOftenIsToldSo) {
+#ifdef __SANITIZE_THREAD__
+  GTEST_SKIP() << "under this sanitizer nobody is answered as often as is allowed";
+#endif
   constexpr int flood = 12'000;
   RawClient hasty(options_.config.api.control);
   hasty.socket().set(zmq::sockopt::sndhwm, 0);

@@ -7,6 +7,7 @@
 extern "C" const char* __tsan_default_suppressions();  // NOLINT(bugprone-reserved-identifier): the sanitizer's name
 extern "C" const char* __tsan_default_suppressions() {
   return "race:libzmq.so\ncalled_from_lib:libzmq.so\n"
+         "race:libsodium.so\ncalled_from_lib:libsodium.so\n"  // by which libzmq decrypts
          "race:libaravis-0.8.so\ncalled_from_lib:libaravis-0.8.so\n"
          "race:libgobject-2.0.so\ncalled_from_lib:libgobject-2.0.so\n"
          "race:libglib-2.0.so\ncalled_from_lib:libglib-2.0.so\n"
