@@ -4,6 +4,7 @@
 #include <CLI/CLI.hpp>
 #include <cstdio>
 #include <iostream>
+#include <opencv2/core/utility.hpp>
 #include <string>
 
 #include "daemon/board_look.h"
@@ -61,6 +62,8 @@ int run(const Arguments& arguments, bool solving) {
 }  // namespace booth
 
 int main(int argc, char** argv) {
+  cv::setNumThreads(1);  // pictures are looked at side by side already, by as many threads as asked for
+
   booth::Arguments arguments;
   CLI::App app("Looks at the shots of a calibration under way, or solves it.", "booth-calibrate");
   app.require_subcommand(1);
