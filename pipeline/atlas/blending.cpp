@@ -92,16 +92,18 @@ std::vector<Eigen::Array3f> colours_around(const Mesh& mesh, std::span<const Eig
   return colours;
 }
 
+Eigen::Array4f padded(const Eigen::Array3f& colour) { return {colour[0], colour[1], colour[2], 0}; }
+
 /// One camera's contribution to a triangle.
 struct DetailView {
   TriangleView view;
   std::array<float, 3> weight{};
-  std::array<Eigen::Array3f, 3> correction;
+  std::array<Eigen::Array4f, 3> correction;
 };
 
 /// A corner that the camera does not see has no correction of its own: it takes the others'.
 void complete_corners(DetailView* of) {
-  Eigen::Array3f correction = Eigen::Array3f::Zero();
+  Eigen::Array4f correction = Eigen::Array4f::Zero();
   float count = 0;
   for (size_t k = 0; k < 3; ++k) {
     if (!(of->weight[k] > 0)) continue;
@@ -119,68 +121,100 @@ class DetailPainter {
                 std::span<const float> weights, std::span<const Eigen::Array3f> around,
                 std::span<const PreparedView> views)
       : views_(views) {
-    for (size_t k = 0; k < 3; ++k) around_[k] = around[triangle[k]];
+    for (size_t k = 0; k < 3; ++k) around_[k] = padded(around[triangle[k]]);
+    cameras_.reserve(seen.size());
     for (const TriangleView& view : seen) {
       DetailView& of = cameras_.emplace_back();
       of.view = view;
       for (size_t k = 0; k < 3; ++k) {
         const size_t i = triangle[k] * views.size() + view.view;
         of.weight[k] = weights[i];
-        of.correction[k] = bands.correction[i];
+        of.correction[k] = padded(bands.correction[i]);
       }
       complete_corners(&of);
     }
   }
 
-  Eigen::Array3f operator()(const Eigen::Vector3f& at) const {
-    std::array<Contribution, most_views_of_triangle> contributions;
-    size_t count = 0;
-    float total = 0, seen = 0;
-    for (const DetailView& of : cameras_) {
-      const float rating = of.view.rating_at(at);
-      if (!(rating > 0)) continue;
-      const Eigen::Vector3f pixel = of.view.pixel_at(at);
-      const Trust trust =
-          of.view.certain ? Trust{1, 1} : look_up(views_[of.view.view], pixel.x(), pixel.y(), pixel.z());
-      seen += rating * trust.visible;
-      const float weight = rating * weight_of(trust);
-      if (!(weight > 0)) continue;
-      total += weight;
-      contributions[count++] = {&of, weight, pixel.head<2>()};
+  void operator()(TexelBatch& batch) const {
+    std::array<Look, most_views_of_triangle> looks;
+    Each total{}, seen{};
+    for (size_t c = 0; c < cameras_.size(); ++c) {
+      look(cameras_[c], batch, &looks[c]);
+      for (size_t i = 0; i < batch.count; ++i) {
+        seen[i] += looks[c].seen[i];
+        total[i] += looks[c].weight[i];
+      }
     }
-    const float share = total > 0 ? smooth_step(hardly_seen, well_seen, seen) : 0;
-    const Eigen::Array3f diffused = at[0] * around_[0] + at[1] * around_[1] + at[2] * around_[2];
-    if (!(share > 0)) return diffused;
-    return share * mean({contributions.data(), count}, total, at) + (1 - share) * diffused;
+    fade({looks.data(), cameras_.size()}, total, batch.count);
+    for (size_t i = 0; i < batch.count; ++i) batch.light[i].setZero();
+    for (size_t c = 0; c < cameras_.size(); ++c) add(cameras_[c], looks[c], batch);
+    for (size_t i = 0; i < batch.count; ++i) {
+      const float share = total[i] > 0 ? smooth_step(hardly_seen, well_seen, seen[i]) : 0;
+      if (share < 1) batch.light[i] = share * batch.light[i] + (1 - share) * at(batch, i, around_);
+    }
   }
 
  private:
-  struct Contribution {
-    const DetailView* of = nullptr;
-    float weight = 0;
-    Eigen::Vector2f pixel;
+  using Each = TexelBatch::Each<float>;
+  /// What a camera has to say about each texel of a batch.
+  struct Look {
+    Each x, y;    ///< pixel
+    Each seen;    ///< rating, 0 where the texel is hidden
+    Each weight;  ///< first against the others', then its share of the colour
   };
 
-  Eigen::Array3f mean(std::span<const Contribution> contributions, float total, const Eigen::Vector3f& at) const {
+  static Eigen::Array4f at(const TexelBatch& batch, size_t i, const std::array<Eigen::Array4f, 3>& corners) {
+    const auto& [a, b, c] = batch.corner_weights;
+    return a[i] * corners[0] + b[i] * corners[1] + c[i] * corners[2];
+  }
+
+  void look(const DetailView& of, const TexelBatch& batch, Look* result) const {
+    const TriangleView& view = of.view;
+    Each depth;
+    view.for_each(batch.corner_weights, batch.count, &result->seen, &result->x, &result->y, &depth);
+    if (view.certain) {
+      result->weight = result->seen;
+      return;
+    }
+    for (size_t i = 0; i < batch.count; ++i) {
+      if (!(result->seen[i] > 0)) {
+        result->weight[i] = 0;
+        continue;
+      }
+      const Trust trust = look_up(views_[view.view], result->x[i], result->y[i], depth[i]);
+      result->weight[i] = result->seen[i] * weight_of(trust);
+      result->seen[i] *= trust.visible;
+    }
+  }
+
+  /// From weights to shares whose sum is 1.
+  static void fade(std::span<Look> looks, const Each& total, size_t count) {
     // A camera below this share of the weights is not worth looking at; subtracted, so that it fades in. With at most
     // sixteen cameras one is always above.
     constexpr float negligible = 0.02F;
-    Eigen::Array3f light = Eigen::Array3f::Zero();
-    float used = 0;
-    for (const Contribution& one : contributions) {
-      const float share = one.weight / total - negligible;
-      if (share <= 0) continue;
-      used += share;
-      const DetailView& of = *one.of;
-      light += share * sample_pyramid(views_[of.view.view].colours, of.view.lod, one.pixel.x(), one.pixel.y()) *
-               (at[0] * of.correction[0] + at[1] * of.correction[1] + at[2] * of.correction[2]);
-    }
-    return light / used;
+    Each scale, used{};
+    for (size_t i = 0; i < count; ++i) scale[i] = total[i] > 0 ? 1 / total[i] : 0;
+    for (Look& look : looks)
+      for (size_t i = 0; i < count; ++i) {
+        look.weight[i] = std::max(0.0F, look.weight[i] * scale[i] - negligible);
+        used[i] += look.weight[i];
+      }
+    for (size_t i = 0; i < count; ++i) scale[i] = used[i] > 0 ? 1 / used[i] : 0;
+    for (Look& look : looks)
+      for (size_t i = 0; i < count; ++i) look.weight[i] *= scale[i];
+  }
+
+  void add(const DetailView& of, const Look& look, TexelBatch& batch) const {
+    const LightPyramid& colours = views_[of.view.view].colours;
+    for (size_t i = 0; i < batch.count; ++i)
+      if (look.weight[i] > 0)
+        batch.light[i] +=
+            look.weight[i] * sample_pyramid(colours, of.view.lod, look.x[i], look.y[i]) * at(batch, i, of.correction);
   }
 
   std::span<const PreparedView> views_;
   std::vector<DetailView> cameras_;
-  std::array<Eigen::Array3f, 3> around_;
+  std::array<Eigen::Array4f, 3> around_;
 };
 
 }  // namespace

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "pipeline/atlas/surface_diffusion.h"
@@ -16,7 +17,7 @@ namespace {
 /// A ray starts above the surface, so that it does not meet the triangle that it leaves.
 constexpr float off_surface_m = 0.002F;
 
-using Corners = std::array<Eigen::Array3f, 3>;
+using Corners = std::array<Eigen::Array4f, 3>;
 
 /// What texels show that no camera sees: the vertices' own colours, diffused to those that have none.
 std::vector<Eigen::Array3f> colours_around(const Mesh& mesh, std::span<const PreparedView> views,
@@ -42,14 +43,67 @@ std::vector<Eigen::Array3f> colours_around(const Mesh& mesh, std::span<const Pre
   return colours;
 }
 
+Eigen::Array4f padded(const Eigen::Array3f& colour) { return {colour[0], colour[1], colour[2], 0}; }
+
 Corners corners_of(const Mesh& mesh, size_t t, std::span<const Eigen::Array3f> colours) {
   const auto& [a, b, c] = mesh.triangles[t];
-  return {colours[a], colours[b], colours[c]};
+  return {padded(colours[a]), padded(colours[b]), padded(colours[c])};
 }
 
-Eigen::Array3f interpolated(const Corners& corners, const Eigen::Vector3f& weights) {
-  return weights[0] * corners[0] + weights[1] * corners[1] + weights[2] * corners[2];
+template <class Value>
+Value interpolated(const TexelBatch& batch, size_t i, const std::array<Value, 3>& corners) {
+  const auto& [a, b, c] = batch.corner_weights;
+  return a[i] * corners[0] + b[i] * corners[1] + c[i] * corners[2];
 }
+
+/// A triangle's places in one camera.
+struct Places {
+  TexelBatch::Each<float> rating, x, y, depth;
+
+  Places(const TriangleView& view, const TexelBatch& batch) {
+    view.for_each(batch.corner_weights, batch.count, &rating, &x, &y, &depth);
+  }
+};
+
+/// The mean of the cameras' colours for the texels of one triangle.
+class MeanPainter {
+ public:
+  MeanPainter(const Mesh& mesh, size_t t, const Corners& around, std::vector<TriangleView> seen,
+              std::span<const PreparedView> views, const Occluder& occluder)
+      : around_(around), seen_(std::move(seen)), views_(views), occluder_(&occluder) {
+    for (size_t k = 0; k < 3; ++k) positions_[k] = mesh.positions[mesh.triangles[t][k]];
+    normal_ = (positions_[1] - positions_[0]).cross(positions_[2] - positions_[0]).normalized();
+  }
+
+  void operator()(TexelBatch& batch) const {
+    TexelBatch::Each<float> total{};
+    for (size_t i = 0; i < batch.count; ++i) batch.light[i].setZero();
+    for (const TriangleView& view : seen_) {
+      const Places places(view, batch);
+      const Eigen::Vector3f eye = views_[view.view].camera->center().cast<float>();
+      for (size_t i = 0; i < batch.count; ++i) {
+        const float rating = places.rating[i];
+        if (!(rating > 0) || (!view.certain && hidden_from(eye, interpolated(batch, i, positions_)))) continue;
+        batch.light[i] += rating * sample_pyramid(views_[view.view].colours, view.lod, places.x[i], places.y[i]);
+        total[i] += rating;
+      }
+    }
+    for (size_t i = 0; i < batch.count; ++i)
+      batch.light[i] = total[i] > 0 ? Eigen::Array4f(batch.light[i] / total[i]) : interpolated(batch, i, around_);
+  }
+
+ private:
+  bool hidden_from(const Eigen::Vector3f& eye, const Eigen::Vector3f& point) const {
+    return occluder_->between(point + off_surface_m * normal_, eye, off_surface_m / (eye - point).norm());
+  }
+
+  Corners around_;
+  std::vector<TriangleView> seen_;
+  std::span<const PreparedView> views_;
+  const Occluder* occluder_;
+  std::array<Eigen::Vector3f, 3> positions_;
+  Eigen::Vector3f normal_;
+};
 
 }  // namespace
 
@@ -67,12 +121,13 @@ TexelColours paint_best_views(const Mesh& mesh, const Packing& packing, int size
           return candidate.view == static_cast<size_t>(best - rating.begin());
         });
         if (!(*best > 0) || view == seen.end())
-          return [corners = corners_of(mesh, t, around)](const Eigen::Vector3f& weights) {
-            return interpolated(corners, weights);
+          return [corners = corners_of(mesh, t, around)](TexelBatch& batch) {
+            for (size_t i = 0; i < batch.count; ++i) batch.light[i] = interpolated(batch, i, corners);
           };
-        return [view = *view, &views](const Eigen::Vector3f& weights) {
-          const Eigen::Vector3f p = view.pixel_at(weights);
-          return sample_pyramid(views[view.view].colours, view.lod, p.x(), p.y());
+        return [view = *view, &views](TexelBatch& batch) {
+          const Places places(view, batch);
+          for (size_t i = 0; i < batch.count; ++i)
+            batch.light[i] = sample_pyramid(views[view.view].colours, view.lod, places.x[i], places.y[i]);
         };
       },
       work);
@@ -82,34 +137,11 @@ TexelColours paint_rating_means(const Mesh& mesh, const Packing& packing, int si
                                 const CameraRatings& ratings, const Occluder& occluder, const Work& work) {
   const std::vector<Eigen::Array3f> around = colours_around(mesh, views, ratings);
   const float usual = usual_rating(ratings);
-  std::vector<Eigen::Vector3f> eyes;
-  for (const PreparedView& view : views) eyes.push_back(view.camera->center().cast<float>());
   return paint_texels(
       packing, size,
       [&](size_t t) -> TrianglePainter {
-        std::array<Eigen::Vector3f, 3> positions;
-        for (size_t k = 0; k < 3; ++k) positions[k] = mesh.positions[mesh.triangles[t][k]];
-        const Eigen::Vector3f normal = (positions[1] - positions[0]).cross(positions[2] - positions[0]).normalized();
-        return [&views, &eyes, &occluder, positions, normal, corners = corners_of(mesh, t, around),
-                seen = views_of_triangle(mesh, packing, t, views, ratings, usual)](const Eigen::Vector3f& weights) {
-          const Eigen::Vector3f point =
-              weights[0] * positions[0] + weights[1] * positions[1] + weights[2] * positions[2];
-          Eigen::Array3f light = Eigen::Array3f::Zero();
-          float total = 0;
-          for (const TriangleView& view : seen) {
-            const float rating = view.rating_at(weights);
-            if (!(rating > 0)) continue;
-            const Eigen::Vector3f& eye = eyes[view.view];
-            const auto hidden = [&] {
-              return occluder.between(point + off_surface_m * normal, eye, off_surface_m / (eye - point).norm());
-            };
-            if (!view.certain && hidden()) continue;
-            const Eigen::Vector3f p = view.pixel_at(weights);
-            light += rating * sample_pyramid(views[view.view].colours, view.lod, p.x(), p.y());
-            total += rating;
-          }
-          return total > 0 ? Eigen::Array3f(light / total) : interpolated(corners, weights);
-        };
+        return MeanPainter(mesh, t, corners_of(mesh, t, around),
+                           views_of_triangle(mesh, packing, t, views, ratings, usual), views, occluder);
       },
       work);
 }

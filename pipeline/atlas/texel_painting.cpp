@@ -7,6 +7,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <utility>
 #include <vector>
 
 #include "pipeline/atlas/linear_light.h"
@@ -19,7 +20,13 @@ constexpr float band_texels = 2.0F;
 
 /// A triangle in the atlas: which texels it has, and where on it they lie.
 struct FlatTriangle {
-  std::array<Eigen::Vector2f, 3> corners;          ///< so that a texel's centre is a whole number
+  /// Points p with inwards · p + offset ≥ −d lie at most d outside an edge's line.
+  struct HalfPlane {
+    Eigen::Vector2f inwards = Eigen::Vector2f::Zero();
+    float offset = 0;
+  };
+  std::array<Eigen::Vector2f, 3> corners;  ///< so that a texel's centre is a whole number
+  std::array<HalfPlane, 3> edges;
   Eigen::Matrix3f barycentric_from_texel;          ///< applied to (x, y, 1)
   int left = 0, right = -1, top = 0, bottom = -1;  ///< with the band, inclusive; not cropped to the atlas
   bool flat = false;                               ///< too thin to hold a texel
@@ -39,10 +46,25 @@ struct FlatTriangle {
     barycentric_from_texel =
         flat ? Eigen::Matrix3f(Eigen::Matrix3f::Zero()) : Eigen::Matrix3f(corner_columns.inverse().cast<float>());
     if (flat) barycentric_from_texel.col(2).setConstant(1.0F / 3);
+    if (!flat) set_edges();
     left = static_cast<int>(std::ceil(low.x() - static_cast<double>(band_texels)));
     right = static_cast<int>(std::floor(high.x() + static_cast<double>(band_texels)));
     top = static_cast<int>(std::ceil(low.y() - static_cast<double>(band_texels)));
     bottom = static_cast<int>(std::floor(high.y() + static_cast<double>(band_texels)));
+  }
+
+  /// The columns of a row, inclusive, outside of which no texel lies within `reach` of all edges' lines.
+  std::pair<int, int> columns(int y, float reach) const {
+    constexpr float rounding = 0.01F;  // texels
+    float from = static_cast<float>(left), to = static_cast<float>(right);
+    for (const HalfPlane& edge : edges) {
+      const float at_zero = edge.inwards.y() * static_cast<float>(y) + edge.offset + reach + rounding;
+      if (edge.inwards.x() > steep)
+        from = std::max(from, -at_zero / edge.inwards.x() - rounding);
+      else if (edge.inwards.x() < -steep)
+        to = std::min(to, -at_zero / edge.inwards.x() + rounding);
+    }
+    return {static_cast<int>(std::ceil(from)), static_cast<int>(std::floor(to))};
   }
 
   Eigen::Vector3f barycentric(int x, int y) const {
@@ -60,6 +82,21 @@ struct FlatTriangle {
     }
     return nearest;
   }
+
+ private:
+  static constexpr float steep = 1e-3F;  ///< an edge along the rows bounds no columns
+
+  void set_edges() {
+    const Eigen::Vector2f ab = corners[1] - corners[0], ac = corners[2] - corners[0];
+    const float turn = ab.x() * ac.y() - ab.y() * ac.x() > 0 ? 1.0F : -1.0F;
+    for (size_t k = 0; k < 3; ++k) {
+      const Eigen::Vector2f edge = corners[(k + 1) % 3] - corners[k];
+      const float length = edge.norm();
+      if (!(length > 0)) continue;
+      edges[k].inwards = turn / length * Eigen::Vector2f(-edge.y(), edge.x());
+      edges[k].offset = -edges[k].inwards.dot(corners[k]);
+    }
+  }
 };
 
 /// Rows of the atlas that are coloured in one piece.
@@ -75,7 +112,7 @@ class Stripe {
   /// Texels with their centre in the triangle; of two triangles that share the centre on an edge, the first.
   void claim_inside(int32_t t, const FlatTriangle& triangle) {
     if (triangle.flat) return;
-    for_each_texel(triangle, [&](int x, int y, size_t i) {
+    for_each_texel(triangle, 0, [&](int x, int y, size_t i) {
       if (owner_[i] != nobody || !(triangle.barycentric(x, y).minCoeff() >= 0)) return;
       owner_[i] = t;
       distance2_[i] = 0;
@@ -84,7 +121,7 @@ class Stripe {
   }
   /// Texels around, for the nearest triangle.
   void claim_band(int32_t t, const FlatTriangle& triangle) {
-    for_each_texel(triangle, [&](int x, int y, size_t i) {
+    for_each_texel(triangle, band_texels, [&](int x, int y, size_t i) {
       if (!(distance2_[i] > 0)) return;
       const float distance2 = triangle.squared_distance(x, y);
       if (!(distance2 <= band_texels * band_texels) || !(distance2 < distance2_[i])) return;
@@ -95,7 +132,7 @@ class Stripe {
   /// Calls paint(x, y) for the triangle's texels.
   template <class Paint>
   void for_each_owned(int32_t t, const FlatTriangle& triangle, const Paint& paint) const {
-    for_each_texel(triangle, [&](int x, int y, size_t i) {
+    for_each_texel(triangle, band_texels, [&](int x, int y, size_t i) {
       if (owner_[i] == t) paint(x, y);
     });
   }
@@ -105,12 +142,14 @@ class Stripe {
   static constexpr int32_t nobody = -1;
 
   template <class Visitor>
-  void for_each_texel(const FlatTriangle& triangle, const Visitor& visit) const {
+  void for_each_texel(const FlatTriangle& triangle, float reach, const Visitor& visit) const {
     const int y0 = std::max(triangle.top, first_row_), y1 = std::min(triangle.bottom, first_row_ + rows_ - 1);
-    const int x0 = std::max(triangle.left, 0), x1 = std::min(triangle.right, size_ - 1);
-    for (int y = y0; y <= y1; ++y)
+    for (int y = y0; y <= y1; ++y) {
+      const auto [from, to] = triangle.columns(y, reach);
+      const int x0 = std::max(from, 0), x1 = std::min(to, size_ - 1);
       for (int x = x0; x <= x1; ++x)
         visit(x, y, static_cast<size_t>(y - first_row_) * static_cast<size_t>(size_) + static_cast<size_t>(x));
+    }
   }
 
   int size_, first_row_, rows_;
@@ -126,11 +165,41 @@ Eigen::Vector3f near_triangle(Eigen::Vector3f barycentric) {
   return barycentric / barycentric.sum();
 }
 
+/// Collects a triangle's texels, has them painted and writes them.
+class BatchWriter {
+ public:
+  BatchWriter(const TrianglePainter& paint, TexelColours* result) : paint_(paint), result_(result) {}
+
+  void add(int x, int y, const Eigen::Vector3f& corner_weights) {
+    for (size_t k = 0; k < 3; ++k)
+      batch_.corner_weights[k][batch_.count] = corner_weights[static_cast<Eigen::Index>(k)];
+    texels_[batch_.count] = {x, y};
+    if (++batch_.count == TexelBatch::capacity) flush();
+  }
+  void flush() {
+    if (batch_.count == 0) return;
+    paint_(batch_);
+    for (size_t i = 0; i < batch_.count; ++i) {
+      const auto [x, y] = texels_[i];
+      uint8_t* out = result_->image.pixel(x, y);
+      for (Eigen::Index c = 0; c < 3; ++c) out[c] = srgb_from_linear(batch_.light[i][c]);
+      result_->painted.at(x, y) = 255;
+    }
+    batch_.count = 0;
+  }
+
+ private:
+  const TrianglePainter& paint_;
+  TexelColours* result_;
+  TexelBatch batch_;
+  std::array<std::pair<int, int>, TexelBatch::capacity> texels_;
+};
+
 }  // namespace
 
 TexelColours paint_texels(const Packing& packing, int size, const std::function<TrianglePainter(size_t)>& painter_of,
                           const Work& work) {
-  constexpr int stripe_rows = 32;
+  constexpr int stripe_rows = 64;
   const auto stripes = static_cast<size_t>((size + stripe_rows - 1) / stripe_rows);
   std::vector<std::vector<int32_t>> triangles_of(stripes);
   for (size_t t = 0; t < packing.corners.size(); ++t) {
@@ -152,11 +221,10 @@ TexelColours paint_texels(const Packing& packing, int size, const std::function<
       for (size_t i = 0; i < flat.size(); ++i) stripe.claim_band(triangles_of[s][i], flat[i]);
       for (size_t i = 0; i < flat.size(); ++i) {
         const TrianglePainter paint = painter_of(static_cast<size_t>(triangles_of[s][i]));
-        stripe.for_each_owned(triangles_of[s][i], flat[i], [&](int x, int y) {
-          const Eigen::Array3f light = paint(near_triangle(flat[i].barycentric(x, y)));
-          for (int c = 0; c < 3; ++c) result.image.at(x, y, c) = srgb_from_linear(light[c]);
-          result.painted.at(x, y) = 255;
-        });
+        BatchWriter writer(paint, &result);
+        stripe.for_each_owned(triangles_of[s][i], flat[i],
+                              [&](int x, int y) { writer.add(x, y, near_triangle(flat[i].barycentric(x, y))); });
+        writer.flush();
       }
       inside[s] = stripe.inside();
     }

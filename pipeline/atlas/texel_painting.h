@@ -1,6 +1,8 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <array>
+#include <cstddef>
 #include <functional>
 
 #include "pipeline/atlas/packing.h"
@@ -15,9 +17,21 @@ struct TexelColours {
   double used_share = 0;  ///< of the texels whose centre lies in a triangle
 };
 
-/// Linear light at a point of a triangle, given by the weights of its corners (their sum is 1). In the band around the
-/// triangle a weight may be below 0.
-using TrianglePainter = std::function<Eigen::Array3f(const Eigen::Vector3f& corner_weights)>;
+/// Texels of one triangle, a few at a time, each quantity contiguous for the processor's vector units.
+struct TexelBatch {
+  static constexpr size_t capacity = 64;
+  template <class T>
+  using Each = std::array<T, capacity>;
+
+  size_t count = 0;
+  /// Where on the triangle the texels lie: the weights of its three corners, whose sum is 1. In the band around the
+  /// triangle a weight may be below 0.
+  std::array<Each<float>, 3> corner_weights;
+  Each<Eigen::Array4f> light;  ///< the painter's answer: linear red, green and blue; the last is not used
+};
+
+/// Gives the texels of a batch, all of one triangle, their colours.
+using TrianglePainter = std::function<void(TexelBatch& batch)>;
 
 /// Colours every texel of every triangle, and a band of two texels around so that bilinear look-ups at its edges stay
 /// on the surface.

@@ -19,14 +19,23 @@ struct TriangleView {
   float lod = 0;         ///< log2 of the pixels under a texel's edge
   bool certain = false;  ///< all of the triangle and its surroundings is visible, far from any outline or depth step
 
-  float rating_at(const Eigen::Vector3f& corner_weights) const { return interpolate(rating, corner_weights); }
-  /// Pixel x, y and depth, perspectively correct.
-  Eigen::Vector3f pixel_at(const Eigen::Vector3f& corner_weights) const {
-    const float z = interpolate(depth, corner_weights);
-    return {interpolate(x_depth, corner_weights) / z, interpolate(y_depth, corner_weights) / z, z};
-  }
-  static float interpolate(const std::array<float, 3>& corners, const Eigen::Vector3f& weights) {
-    return weights[0] * corners[0] + weights[1] * corners[1] + weights[2] * corners[2];
+  /// Of each of the first `count` places, given by the weights of the corners: the rating, 0 where it would be below;
+  /// pixel and depth, perspectively correct.
+  template <size_t places>
+  void for_each(const std::array<std::array<float, places>, 3>& corner_weights, size_t count,
+                std::array<float, places>* rating_at, std::array<float, places>* x, std::array<float, places>* y,
+                std::array<float, places>* z) const {
+    const auto& [a, b, c] = corner_weights;
+    const auto interpolated = [&](const std::array<float, 3>& corners, size_t i) {
+      return a[i] * corners[0] + b[i] * corners[1] + c[i] * corners[2];
+    };
+    for (size_t i = 0; i < count; ++i) {
+      const float rating_here = interpolated(rating, i);
+      (*rating_at)[i] = rating_here > 0 ? rating_here : 0;
+      (*z)[i] = interpolated(depth, i);
+      (*x)[i] = interpolated(x_depth, i) / (*z)[i];
+      (*y)[i] = interpolated(y_depth, i) / (*z)[i];
+    }
   }
 };
 

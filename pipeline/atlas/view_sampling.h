@@ -2,8 +2,11 @@
 
 #include <Eigen/Core>
 #include <algorithm>
+#include <bit>
 #include <cmath>
+#include <cstddef>
 #include <cstdint>
+#include <cstring>
 
 #include "pipeline/atlas/input_preparation.h"
 
@@ -11,15 +14,29 @@ namespace booth {
 
 namespace sampling {
 
+/// Four numbers in one register: vectors of the compiler rather than Eigen's, for those cannot be converted from
+/// integers at once.
+using Floats = float __attribute__((vector_size(16)));
+
 /// A pixel's red, green, blue and padding.
-inline Eigen::Array4f pixel_at(const uint16_t* p) {
-  return {static_cast<float>(p[0]), static_cast<float>(p[1]), static_cast<float>(p[2]), static_cast<float>(p[3])};
+inline Floats pixel_at(const uint16_t* p) {
+  using Words = uint16_t __attribute__((vector_size(8)));
+  using Integers = int32_t __attribute__((vector_size(16)));
+  Words words;
+  std::memcpy(&words, p, sizeof words);
+  return __builtin_convertvector(
+      std::bit_cast<Integers>(__builtin_shufflevector(words, Words{}, 0, 4, 1, 5, 2, 6, 3, 7)), Floats);
 }
 
-}  // namespace sampling
+/// Of the four pixels around a place that is `f` behind the second.
+inline Floats cubic_weights(float f) {
+  constexpr Floats constant{0, 1, 0, 0}, linear{-0.5F, 0, 0.5F, 0}, square{1, -2.5F, 2, -0.5F},
+      cube{-0.5F, 1.5F, -1.5F, 0.5F};
+  return constant + f * (linear + f * (square + f * cube));
+}
 
-/// Linear light at a pixel of level 0, interpolated bilinearly on one level of the pyramid.
-inline Eigen::Array3f sample_level(const LightPyramid& pyramid, size_t level, float x, float y) {
+/// Light of sample_level() in the camera's units.
+inline Floats bilinear(const LightPyramid& pyramid, size_t level, float x, float y) {
   const LightImage& image = pyramid[level];
   const float scale = 1 / static_cast<float>(1 << level);
   const float u = std::clamp((x + 0.5F) * scale - 0.5F, 0.0F, static_cast<float>(image.width - 1));
@@ -30,44 +47,48 @@ inline Eigen::Array3f sample_level(const LightPyramid& pyramid, size_t level, fl
   const uint16_t* a = image.pixel(u0, v0);
   const uint16_t* b = image.width > 1 ? a + 4 : a;
   const ptrdiff_t down = image.height > 1 ? 4 * static_cast<ptrdiff_t>(image.width) : 0;
-  using sampling::pixel_at;
-  const Eigen::Array4f light = (1 - fv) * ((1 - fu) * pixel_at(a) + fu * pixel_at(b)) +
-                               fv * ((1 - fu) * pixel_at(a + down) + fu * pixel_at(b + down));
-  return light.head<3>() / full_light;
+  return (1 - fv) * ((1 - fu) * pixel_at(a) + fu * pixel_at(b)) +
+         fv * ((1 - fu) * pixel_at(a + down) + fu * pixel_at(b + down));
 }
 
-/// The same on level 0 by cubic convolution, which keeps the detail that bilinear interpolation blurs. Next to the
-/// image's border it is bilinear.
+/// Light of sample_pyramid() on level 0 in the camera's units, by cubic convolution, which keeps the detail that
+/// bilinear interpolation blurs. Next to the image's border it is bilinear.
 /// Source: R. Keys, "Cubic convolution interpolation for digital image processing", IEEE ASSP 29(6), 1981.
-inline Eigen::Array3f sample_cubic(const LightPyramid& pyramid, float x, float y) {
+inline Floats cubic(const LightPyramid& pyramid, float x, float y) {
   const LightImage& image = pyramid.front();
-  const int u0 = static_cast<int>(std::floor(x)), v0 = static_cast<int>(std::floor(y));
-  if (!(u0 >= 1 && v0 >= 1 && u0 + 2 < image.width && v0 + 2 < image.height)) return sample_level(pyramid, 0, x, y);
-  const auto weights = [](float f) -> Eigen::Array4f {
-    const float f2 = f * f, f3 = f2 * f;
-    return {-0.5F * f + f2 - 0.5F * f3, 1 - 2.5F * f2 + 1.5F * f3, 0.5F * f + 2 * f2 - 1.5F * f3,
-            -0.5F * f2 + 0.5F * f3};
-  };
-  const Eigen::Array4f across = weights(x - static_cast<float>(u0)), along = weights(y - static_cast<float>(v0));
-  Eigen::Array4f light = Eigen::Array4f::Zero();
+  if (!(x >= 1 && y >= 1 && x < static_cast<float>(image.width - 2) && y < static_cast<float>(image.height - 2)))
+    return bilinear(pyramid, 0, x, y);
+  const int u0 = static_cast<int>(x), v0 = static_cast<int>(y);
+  const Floats across = cubic_weights(x - static_cast<float>(u0)), along = cubic_weights(y - static_cast<float>(v0));
   const uint16_t* row = image.pixel(u0 - 1, v0 - 1);
-  for (int j = 0; j < 4; ++j, row += 4 * static_cast<ptrdiff_t>(image.width))
-    light += along[j] * (across[0] * sampling::pixel_at(row) + across[1] * sampling::pixel_at(row + 4) +
-                         across[2] * sampling::pixel_at(row + 8) + across[3] * sampling::pixel_at(row + 12));
-  return light.head<3>().max(0) / full_light;
+  const ptrdiff_t down = 4 * static_cast<ptrdiff_t>(image.width);
+  Floats light{};
+  for (size_t j = 0; j < 4; ++j, row += down)
+    light += along[j] * (across[0] * pixel_at(row) + across[1] * pixel_at(row + 4) + across[2] * pixel_at(row + 8) +
+                         across[3] * pixel_at(row + 12));
+  return light > 0 ? light : Floats{};
+}
+
+}  // namespace sampling
+
+/// Linear light at a pixel of level 0, interpolated bilinearly on one level of the pyramid.
+inline Eigen::Array3f sample_level(const LightPyramid& pyramid, size_t level, float x, float y) {
+  const sampling::Floats light = sampling::bilinear(pyramid, level, x, y) / full_light;
+  return {light[0], light[1], light[2]};
 }
 
 /// Linear light under a footprint of 2^lod pixels: between two levels, linearly, so that nothing aliases where a texel
-/// covers several pixels; by cubic convolution where it covers one or less.
+/// covers several pixels; by cubic convolution where it covers one or less. The last of four is not used.
 /// Source: L. Williams, "Pyramidal parametrics", SIGGRAPH 1983.
-inline Eigen::Array3f sample_pyramid(const LightPyramid& pyramid, float lod, float x, float y) {
+inline Eigen::Array4f sample_pyramid(const LightPyramid& pyramid, float lod, float x, float y) {
   const float level = std::clamp(lod, 0.0F, static_cast<float>(pyramid.size() - 1));
   const auto fine = static_cast<size_t>(level);
   const float rest = level - static_cast<float>(fine);
   constexpr float negligible = 0.05F;
-  const Eigen::Array3f light = fine == 0 ? sample_cubic(pyramid, x, y) : sample_level(pyramid, fine, x, y);
-  if (rest < negligible) return light;
-  return (1 - rest) * light + rest * sample_level(pyramid, fine + 1, x, y);
+  sampling::Floats light = fine == 0 ? sampling::cubic(pyramid, x, y) : sampling::bilinear(pyramid, fine, x, y);
+  if (rest >= negligible) light = (1 - rest) * light + rest * sampling::bilinear(pyramid, fine + 1, x, y);
+  light /= full_light;
+  return Eigen::Map<const Eigen::Array4f, Eigen::Aligned16>(&light[0]);
 }
 
 /// What is known about a surface point in a camera; both 0 … 1.
