@@ -35,7 +35,7 @@ class WhiteClearance {
   explicit WhiteClearance(const BoardPattern& pattern) : step_m_(pattern.board().square_m / steps) {
     const CalibrationBoard& board = pattern.board();
     // A frame of what is not white: whether paper goes on beyond the board nobody knows.
-    cv::Mat white = cv::Mat::zeros(board.squares_y * steps + 2, board.squares_x * steps + 2, CV_8UC1);
+    cv::Mat white(board.squares_y * steps + 2, board.squares_x * steps + 2, CV_8UC1, cv::Scalar(0));
     for (int y = 0; y < board.squares_y * steps; ++y)
       for (int x = 0; x < board.squares_x * steps; ++x)
         white.at<uint8_t>(y + 1, x + 1) = pattern.white((x + 0.5) * step_m_, (y + 0.5) * step_m_) ? 255 : 0;
