@@ -72,7 +72,7 @@ Result<std::vector<BoardView>> projector_views(const Recording& recording, const
         for (const Frame& frame : set.frames)
           if (frame.camera == view.camera) frames.push_back(frame);
       if (frames.empty()) continue;
-      const auto decoded = decode_gray_code(frames, *shot.pattern, nullptr, {}, work);
+      const auto decoded = decode_gray_code(frames, *shot.pattern, nullptr, nullptr, {}, work);
       if (!decoded) {
         messages.push_back(shot.name + ": " + view.camera + ": " + decoded.error().message);
         continue;

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <Eigen/Geometry>
 #include <span>
 #include <string>
 #include <vector>
@@ -17,6 +18,26 @@ struct GrayCodeOptions {
   /// Between lit and unlit, in standard deviations of a bit's difference, averaged over as many pixels as it is read
   /// from: below that a pixel is not decoded, 1 … 100.
   double min_snr = 3.0;
+};
+
+/// Where in a camera's image something is looked for, by square tiles from its top left, and which pixels of the
+/// projector's image can light it.
+struct SearchTiles {
+  static constexpr int size_px = 16;
+
+  int columns = 0, rows = 0;
+  std::vector<Eigen::AlignedBox2i> lit_from;  ///< by tile, row by row; corners included; empty: nothing is looked for
+
+  /// Everything in an image of that size, whichever pixel lights it.
+  static SearchTiles everywhere(int width, int height);
+
+  Eigen::AlignedBox2i& at(int column, int row) { return lit_from[static_cast<size_t>(row * columns + column)]; }
+  const Eigen::AlignedBox2i& at(int column, int row) const {
+    return lit_from[static_cast<size_t>(row * columns + column)];
+  }
+  const Eigen::AlignedBox2i& of_pixel(const Eigen::Vector2i& pixel) const {
+    return at(pixel.x() / size_px, pixel.y() / size_px);
+  }
 };
 
 /// Which point of the projector's image lights each pixel of a camera.
@@ -47,8 +68,10 @@ struct ProjectorCoordinates {
 /// @param frames   of one camera, grey or RGB, index as in recording.json's order; at most one per index
 /// @param subject  255 where the camera sees the subject, as large as the images: what lies well away from it is not
 ///                 decoded; nullptr decodes everything that is lit
+/// @param tiles    as large as the images: what is not looked for is not decoded; nullptr decodes everything
 /// @return positions for the camera's pixels, distorted as captured; (0,0) is the centre of the projector's first pixel
-/// @error invalid_argument  sizes that differ, a pattern without columns or rows
+/// @error invalid_argument  sizes that differ
+/// @error unsupported       a pattern without columns or rows, or of more than 65536 of them
 /// @error no_subject        images of a bit that cannot be done without are missing, or hardly any pixel is lit
 /// Cost: O(images × pixels) in one pass of rows. Same input, same bytes, whatever the thread count.
 /// Source: bits and order: S. Inokuchi et al., "Range imaging system for 3-D object recognition", ICPR 1984, as
@@ -56,7 +79,7 @@ struct ProjectorCoordinates {
 /// classification for 3D modeling with structured light", GI 2007; edges between pattern and inverse: M. Trobina,
 /// "Error model of a coded-light range sensor", ETH 1995.
 Result<ProjectorCoordinates> decode_gray_code(std::span<const Frame> frames, const GrayCodePattern& pattern,
-                                              const Image* subject = nullptr, const GrayCodeOptions& options = {},
-                                              const Work& work = {});
+                                              const Image* subject = nullptr, const SearchTiles* tiles = nullptr,
+                                              const GrayCodeOptions& options = {}, const Work& work = {});
 
 }  // namespace booth

@@ -2,8 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <map>
-#include <memory>
+#include <numbers>
 #include <optional>
 #include <utility>
 
@@ -14,46 +15,75 @@ namespace {
 
 std::string millimetres(double metres) { return std::to_string(std::lround(1000 * metres)) + " mm"; }
 
-/// The pixels of a camera that can show something of a box; all of them where part of it is behind the camera.
-Eigen::AlignedBox2i pixels_of(const Eigen::AlignedBox3d& box, const RigCamera& camera) {
-  const Eigen::Vector2i last(camera.intrinsics.width - 1, camera.intrinsics.height - 1);
-  const Eigen::AlignedBox2i whole(Eigen::Vector2i::Zero(), last);
-  Eigen::AlignedBox2i pixels;
-  for (int corner = 0; corner < 8; ++corner) {
-    const auto at = project(camera, box.corner(static_cast<Eigen::AlignedBox3d::CornerType>(corner)));
-    if (!at) return whole;
-    const Eigen::Vector2d near = at->cwiseMax(0.0).cwiseMin(last.cast<double>());
-    pixels.extend(near.array().round().matrix().cast<int>());
+/// Distances along a ray, in units of its direction, at which it enters and leaves a box; nothing where it misses it.
+std::optional<std::pair<double, double>> crossing(const Eigen::AlignedBox3d& box, const Eigen::Vector3d& origin,
+                                                  const Eigen::Vector3d& direction) {
+  double enter = 0, leave = std::numeric_limits<double>::infinity();
+  for (int axis = 0; axis < 3; ++axis) {
+    if (direction[axis] == 0) {
+      if (origin[axis] < box.min()[axis] || origin[axis] > box.max()[axis]) return std::nullopt;
+      continue;
+    }
+    const double a = (box.min()[axis] - origin[axis]) / direction[axis],
+                 b = (box.max()[axis] - origin[axis]) / direction[axis];
+    enter = std::max(enter, std::min(a, b));
+    leave = std::min(leave, std::max(a, b));
   }
-  return pixels;
+  if (enter > leave) return std::nullopt;
+  return std::pair{enter, leave};
 }
 
-Image part_of(const Image& image, const Eigen::AlignedBox2i& pixels) {
-  const Eigen::Vector2i size = pixels.sizes() + Eigen::Vector2i::Ones();
-  Image part(size.x(), size.y(), image.channels);
-  for (int y = 0; y < size.y(); ++y)
-    std::copy_n(image.pixel(pixels.min().x(), pixels.min().y() + y),
-                static_cast<size_t>(size.x()) * static_cast<size_t>(image.channels), part.pixel(0, y));
-  return part;
-}
-
-/// decode_gray_code for the part of a camera's images that the region lies in.
-Result<ProjectorCoordinates> decode_part(std::vector<Frame> frames, const GrayCodePattern& pattern,
-                                         const Image* subject, const Eigen::AlignedBox2i& pixels,
-                                         const GrayCodeOptions& options, const Work& work) {
-  std::optional<Image> subject_part;
-  const Eigen::Vector2i needed = pixels.max() + Eigen::Vector2i::Ones();
-  for (Frame& frame : frames) {
-    if (frame.pixels->width < needed.x() || frame.pixels->height < needed.y())
-      return Error{ErrorCode::invalid_argument, "camera " + frame.camera + ": image " + std::to_string(frame.index) +
-                                                    " of the Gray-code sequence is smaller than the rig says"};
-    frame.pixels = std::make_shared<const Image>(part_of(*frame.pixels, pixels));
-  }
-  if (subject != nullptr && subject->width >= needed.x() && subject->height >= needed.y())
-    subject_part = part_of(*subject, pixels);
-  auto decoded = decode_gray_code(frames, pattern, subject_part ? &*subject_part : nullptr, options, work);
-  if (decoded) decoded->origin = pixels.min();
-  return decoded;
+/// Which tiles of a camera's images can show something of a box, and from which of the projector's pixels it can be
+/// lit: those that project what the tile's corner rays have in the box.
+SearchTiles tiles_showing(const Eigen::AlignedBox3d& box, const RigCamera& camera, const CalibratedView* projector,
+                          const GrayCodePattern& pattern) {
+  SearchTiles tiles = SearchTiles::everywhere(camera.intrinsics.width, camera.intrinsics.height);
+  const Eigen::Vector3d center = camera.center();
+  // A tile's corner rays may pass beside the box while those between them meet it.
+  const double farthest = (box.center() - center).norm() + 0.5 * box.diagonal().norm();
+  const double tile_m = std::numbers::sqrt2 * SearchTiles::size_px * farthest / camera.intrinsics.fx;
+  const Eigen::AlignedBox3d wide(box.min().array() - tile_m, box.max().array() + tile_m);
+  struct Corner {
+    bool meets = false;
+    Eigen::AlignedBox2d lit_from;  ///< empty: cannot be told
+  };
+  std::vector<Corner> corners;
+  for (int row = 0; row <= tiles.rows; ++row)
+    for (int column = 0; column <= tiles.columns; ++column) {
+      Corner& corner = corners.emplace_back();
+      const Eigen::Vector3d ray = world_ray(camera, SearchTiles::size_px * Eigen::Vector2d(column, row));
+      const auto inside = crossing(wide, center, ray);
+      corner.meets = inside.has_value();
+      if (!inside || projector == nullptr) continue;
+      const auto enters = project(*projector, center + inside->first * ray),
+                 leaves = project(*projector, center + inside->second * ray);
+      if (enters && leaves) corner.lit_from.extend(*enters).extend(*leaves);
+    }
+  const Eigen::AlignedBox2i whole(Eigen::Vector2i::Zero(), Eigen::Vector2i(pattern.width, pattern.height));
+  for (int row = 0; row < tiles.rows; ++row)
+    for (int column = 0; column < tiles.columns; ++column) {
+      Eigen::AlignedBox2d lit_from;
+      bool meets = false, told = true;
+      for (const int at : {row * (tiles.columns + 1) + column, (row + 1) * (tiles.columns + 1) + column})
+        for (const Corner* corner : {&corners[static_cast<size_t>(at)], &corners[static_cast<size_t>(at + 1)]}) {
+          meets |= corner->meets;
+          if (!corner->meets) continue;
+          told &= !corner->lit_from.isEmpty();
+          lit_from.extend(corner->lit_from);
+        }
+      Eigen::AlignedBox2i& found = tiles.at(column, row);
+      if (!meets) {
+        found.setEmpty();
+      } else if (told) {
+        constexpr double bent = 4;  // projector pixels: lines between the corners' points are not straight
+        const Eigen::Vector2d size = whole.max().cast<double>();
+        found = Eigen::AlignedBox2i((lit_from.min().array() - bent).max(0.0).min(size.array()).matrix().cast<int>(),
+                                    (lit_from.max().array() + bent).max(0.0).min(size.array()).matrix().cast<int>());
+      } else {
+        found = whole;
+      }
+    }
+  return tiles;
 }
 
 /// What is measured outside the volume (walls, housings) is not the subject.
@@ -70,9 +100,11 @@ size_t crop(const Eigen::AlignedBox3d& volume, RangeScan* scan) {
 }
 
 double median_distance(const RangeScan& scan, const Eigen::Vector3f& from) {
+  constexpr size_t stride = 17;  // enough of them
   std::vector<float> distances;
-  for (size_t i = 0; i < scan.points.size(); ++i)
+  for (size_t i = 0; i < scan.points.size(); i += stride)
     if (scan.measured(i)) distances.push_back((scan.points[i] - from).norm());
+  if (distances.empty()) return 0;
   const auto middle = distances.begin() + static_cast<std::ptrdiff_t>(distances.size() / 2);
   std::nth_element(distances.begin(), middle, distances.end());
   return static_cast<double>(*middle);
@@ -99,8 +131,9 @@ Result<StructuredLightScan> scan_structured_light(const Rig& rig, const GrayCode
     const Image* subject = silhouette == silhouettes.end() ? nullptr : &silhouette->coverage;
     const RigCamera* calibrated = rig.find(camera);
     if (calibrated == nullptr) return Error{ErrorCode::not_found, "the rig has no camera " + camera};
-    auto decoded =
-        decode_part(frames, capture.pattern, subject, pixels_of(inside, *calibrated), options.decoding, work);
+    const SearchTiles tiles =
+        tiles_showing(inside, *calibrated, rig.projector ? &*rig.projector : nullptr, capture.pattern);
+    auto decoded = decode_gray_code(frames, capture.pattern, subject, &tiles, options.decoding, work);
     if (work.stopped()) return Work::cancelled();
     if (!decoded) {
       out.warnings.push_back("left out of the face scan: " + decoded.error().message);

@@ -1,8 +1,6 @@
 #include "pipeline/structured_light/triangulation.h"
 
-#include <Eigen/Cholesky>
-#include <Eigen/Eigenvalues>
-#include <Eigen/LU>
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -15,29 +13,34 @@ namespace {
 
 constexpr float nan = std::numeric_limits<float>::quiet_NaN();
 
-/// The undistorted direction of every pixel, by interpolation between exact ones: distortion is smooth.
+/// The world's directions, of depth 1, that part of a view's pixels look in, by interpolation between exact ones:
+/// distortion is smooth.
 class RayTable {
  public:
-  explicit RayTable(const Intrinsics& k) : columns_((k.width - 1) / spacing + 2), rows_((k.height - 1) / spacing + 2) {
-    rays_.reserve(static_cast<size_t>(columns_ * rows_));
+  RayTable(const CalibratedView& view, const Eigen::AlignedBox2d& pixels)
+      : origin_(pixels.min()),
+        columns_(static_cast<int>(pixels.sizes().x()) / spacing + 2),
+        rows_(static_cast<int>(pixels.sizes().y()) / spacing + 2) {
+    const Eigen::Matrix3d world_from_camera = view.camera_from_world.linear().transpose();
+    rays_.reserve(static_cast<size_t>(columns_) * static_cast<size_t>(rows_));
     for (int y = 0; y < rows_; ++y)
       for (int x = 0; x < columns_; ++x)
-        rays_.push_back(unproject(k, Eigen::Vector2d(x * spacing, y * spacing)).head<2>());
+        rays_.emplace_back(world_from_camera * unproject(view.intrinsics, origin_ + spacing * Eigen::Vector2d(x, y)));
   }
-  /// (x, y) of the direction (x, y, 1) in the camera frame.
-  Eigen::Vector2d at(const Eigen::Vector2d& pixel) const {
+  Eigen::Vector3d at(const Eigen::Vector2d& pixel) const {
     const Eigen::Vector2d p =
-        (pixel / spacing).cwiseMax(0.0).cwiseMin(Eigen::Vector2d(columns_ - 1.001, rows_ - 1.001));
+        ((pixel - origin_) / spacing).cwiseMax(0.0).cwiseMin(Eigen::Vector2d(columns_ - 1.001, rows_ - 1.001));
     const int x = static_cast<int>(p.x()), y = static_cast<int>(p.y());
     const double a = p.x() - x, b = p.y() - y;
-    const Eigen::Vector2d* r = rays_.data() + y * columns_ + x;
+    const Eigen::Vector3d* r = rays_.data() + static_cast<std::ptrdiff_t>(y) * columns_ + x;
     return (1 - b) * ((1 - a) * r[0] + a * r[1]) + b * ((1 - a) * r[columns_] + a * r[columns_ + 1]);
   }
 
  private:
   static constexpr int spacing = 8;
+  Eigen::Vector2d origin_;
   int columns_, rows_;
-  std::vector<Eigen::Vector2d> rays_;
+  std::vector<Eigen::Vector3d> rays_;
 };
 
 /// Where in a camera's image each projector pixel is seen: x, y and their standard deviation, camera pixels.
@@ -45,27 +48,27 @@ FloatImage invert(const ProjectorCoordinates& view, int width, int height) {
   FloatImage inverse(width, height, 3, nan);
   const FloatImage& map = view.position;
   constexpr float widest = 6;  // projector pixels between neighbours: farther apart they are two surfaces
-  const auto draw = [&](const std::array<Eigen::Vector2i, 3>& pixel) {
-    std::array<Eigen::Vector2f, 3> p;
-    for (size_t c = 0; c < 3; ++c) {
-      const float* at = map.pixel(pixel[c].x(), pixel[c].y());
-      p[c] = {at[0], at[1]};
-      if (at[0] != at[0]) return;
-    }
+  const auto draw = [&](const std::array<Eigen::Vector2i, 3>& pixel, const std::array<Eigen::Vector2f, 3>& p) {
+    const Eigen::Vector2f low = p[0].cwiseMin(p[1]).cwiseMin(p[2]), high = p[0].cwiseMax(p[1]).cwiseMax(p[2]);
+    const auto first = [](float from) { return std::max(0, static_cast<int>(std::ceil(from))); };
+    const int x0 = first(low.x()), y0 = first(low.y());
+    const int x1 = std::min(static_cast<int>(high.x()), width - 1),
+              y1 = std::min(static_cast<int>(high.y()), height - 1);
+    if (x0 > x1 || y0 > y1) return;
     const Eigen::Vector2f e1 = p[1] - p[0], e2 = p[2] - p[0];
-    if (std::max({e1.norm(), e2.norm(), (e2 - e1).norm()}) > widest) return;
+    if (std::max({e1.squaredNorm(), e2.squaredNorm(), (e2 - e1).squaredNorm()}) > widest * widest) return;
     const float area = e1.x() * e2.y() - e1.y() * e2.x();  // of a camera pixel, in projector pixels
     constexpr float grazing = 0.02F;
     if (std::abs(area) < grazing) return;
     float sigma = 0;
     for (const Eigen::Vector2i& at : pixel) sigma = std::max(sigma, view.sigma.at(at.x(), at.y()));
     sigma /= std::sqrt(std::abs(area));
-    const Eigen::Vector2f low = p[0].cwiseMin(p[1]).cwiseMin(p[2]), high = p[0].cwiseMax(p[1]).cwiseMax(p[2]);
-    for (int y = std::max(0, static_cast<int>(std::ceil(low.y()))); y <= static_cast<int>(high.y()) && y < height; ++y)
-      for (int x = std::max(0, static_cast<int>(std::ceil(low.x()))); x <= static_cast<int>(high.x()) && x < width;
-           ++x) {
+    const float per_area = 1 / area;
+    for (int y = y0; y <= y1; ++y)
+      for (int x = x0; x <= x1; ++x) {
         const Eigen::Vector2f d = Eigen::Vector2f(static_cast<float>(x), static_cast<float>(y)) - p[0];
-        const float b1 = (d.x() * e2.y() - d.y() * e2.x()) / area, b2 = (e1.x() * d.y() - e1.y() * d.x()) / area;
+        const float b1 = (d.x() * e2.y() - d.y() * e2.x()) * per_area,
+                    b2 = (e1.x() * d.y() - e1.y() * d.x()) * per_area;
         constexpr float rim = -1e-5F;
         if (b1 < rim || b2 < rim || b1 + b2 > 1 - rim) continue;
         float* out = inverse.pixel(x, y);
@@ -79,20 +82,30 @@ FloatImage invert(const ProjectorCoordinates& view, int width, int height) {
   };
   for (int y = 0; y + 1 < map.height; ++y)
     for (int x = 0; x + 1 < map.width; ++x) {
-      const Eigen::Vector2i a(x, y), b(x + 1, y), c(x, y + 1), d(x + 1, y + 1);
-      draw({a, b, d});
-      draw({a, d, c});
+      const Eigen::Map<const Eigen::Vector2f> a(map.pixel(x, y)), b(map.pixel(x + 1, y)), c(map.pixel(x, y + 1)),
+          d(map.pixel(x + 1, y + 1));
+      if (std::isnan(a.x()) || std::isnan(d.x())) continue;
+      const Eigen::Vector2i pixel(x, y);
+      if (!std::isnan(b.x())) draw({pixel, {x + 1, y}, {x + 1, y + 1}}, {a, b, d});
+      if (!std::isnan(c.x())) draw({pixel, {x + 1, y + 1}, {x, y + 1}}, {a, d, c});
     }
   return inverse;
 }
 
+/// One of the views that see a point.
+struct View {
+  explicit View(const CalibratedView& view)
+      : center(view.center()), axis(view.camera_from_world.linear().row(2)), focal(view.intrinsics.fx) {}
+  Eigen::Vector3d center;
+  Eigen::Vector3d axis;  ///< of its optics in the world
+  double focal;          ///< pixels
+};
+
 /// A ray with what its pixel's uncertainty means at unit depth.
 struct Sight {
-  Eigen::Vector3d center;
+  const View* view;
   Eigen::Vector3d direction;  ///< world, of depth 1 in the camera's frame
   double sigma;               ///< at unit depth
-  double focal;               ///< pixels
-  Eigen::Vector3d axis;       ///< the camera's optical axis in the world
 };
 
 struct Meeting {
@@ -101,36 +114,49 @@ struct Meeting {
   double sigma_m = 0;
 };
 
+constexpr size_t most_sights = 8;
+
 /// The point of least weighted squared distance to the rays.
 std::optional<Meeting> meet(std::span<const Sight> sights) {
   Meeting found;
-  std::array<double, 8> depth;
+  std::array<double, most_sights> depth;
   depth.fill(1);
-  Eigen::Matrix3d normal;
+  Eigen::Matrix3d covariance;
   for (int pass = 0; pass < 2; ++pass) {  // the depths, which the weights need, are good enough after the first
-    normal.setZero();
+    double xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
     Eigen::Vector3d right = Eigen::Vector3d::Zero();
     for (size_t i = 0; i < sights.size(); ++i) {
-      const Eigen::Vector3d d = sights[i].direction.normalized();
-      const double spread = sights[i].sigma * depth[i];
-      const Eigen::Matrix3d across = (Eigen::Matrix3d::Identity() - d * d.transpose()) / (spread * spread);
-      normal += across;
-      right += across * sights[i].center;
+      const Eigen::Vector3d &d = sights[i].direction, &center = sights[i].view->center;
+      const double spread = sights[i].sigma * depth[i], w = 1 / (spread * spread), along = w / d.squaredNorm();
+      xx += w - along * d.x() * d.x();
+      xy -= along * d.x() * d.y();
+      xz -= along * d.x() * d.z();
+      yy += w - along * d.y() * d.y();
+      yz -= along * d.y() * d.z();
+      zz += w - along * d.z() * d.z();
+      right += w * center - (along * d.dot(center)) * d;
     }
-    found.point = normal.ldlt().solve(right);
+    const double a = yy * zz - yz * yz, b = xz * yz - xy * zz, c = xy * yz - xz * yy;
+    const double determinant = xx * a + xy * b + xz * c;
+    if (!(determinant > 0)) return std::nullopt;
+    const double e = xx * zz - xz * xz, f = xy * xz - xx * yz, g = xx * yy - xy * xy;
+    covariance << a, b, c, b, e, f, c, f, g;
+    covariance /= determinant;
+    found.point = covariance * right;
     for (size_t i = 0; i < sights.size(); ++i) {
-      depth[i] = sights[i].axis.dot(found.point - sights[i].center);
+      depth[i] = sights[i].view->axis.dot(found.point - sights[i].view->center);
       if (!(depth[i] > 0)) return std::nullopt;
     }
   }
   for (size_t i = 0; i < sights.size(); ++i) {
-    const Eigen::Vector3d off = (found.point - sights[i].center) / depth[i] - sights[i].direction;
-    found.residual_px = std::max(found.residual_px, off.norm() * sights[i].focal);
+    const Eigen::Vector3d off = (found.point - sights[i].view->center) / depth[i] - sights[i].direction;
+    found.residual_px = std::max(found.residual_px, off.norm() * sights[i].view->focal);
   }
-  Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> eigen;
-  eigen.computeDirect(normal, Eigen::EigenvaluesOnly);
-  const double least = eigen.eigenvalues()[0];
-  found.sigma_m = least > 0 ? 1 / std::sqrt(least) : std::numeric_limits<double>::infinity();
+  // The largest standard deviation of any direction, by powers: depth is far less certain than the rest.
+  Eigen::Index largest = 0;
+  covariance.diagonal().maxCoeff(&largest);
+  const Eigen::Vector3d direction = covariance * covariance.col(largest);
+  found.sigma_m = std::sqrt(direction.dot(covariance * direction) / direction.squaredNorm());
   return found;
 }
 
@@ -144,11 +170,11 @@ Result<RangeScan> triangulate(const Rig& rig, std::span<const ProjectorCoordinat
   if (projector != nullptr && (projector->intrinsics.width != width || projector->intrinsics.height != height))
     return Error{ErrorCode::invalid_argument,
                  "the Gray-code pattern is not as large as the calibrated projector's image"};
-  constexpr size_t most_views = 7;  // more add nothing
+  constexpr size_t most_views = most_sights - 1;  // more add nothing
   if (views.size() > most_views) views = views.first(most_views);
 
   struct Source {
-    const CalibratedView* camera;
+    View view;
     RayTable rays;
     FloatImage map;
   };
@@ -156,19 +182,27 @@ Result<RangeScan> triangulate(const Rig& rig, std::span<const ProjectorCoordinat
   for (const ProjectorCoordinates& view : views) {
     const RigCamera* camera = rig.find(view.camera);
     if (camera == nullptr) return Error{ErrorCode::not_found, "the rig has no camera " + view.camera};
-    sources.push_back({camera, RayTable(camera->intrinsics), {}});
+    const Eigen::Vector2d last(view.position.width - 1, view.position.height - 1);
+    const Eigen::Vector2d origin = view.origin.cast<double>();
+    sources.push_back({View(*camera), RayTable(*camera, {origin, origin + last}), {}});
   }
   work.parallel_for(sources.size(), 1, [&](size_t begin, size_t end) {
     for (size_t s = begin; s < end; ++s) sources[s].map = invert(views[s], width, height);
   });
   if (work.stopped()) return Work::cancelled();
-  std::optional<RayTable> projector_rays;
-  if (projector != nullptr) projector_rays.emplace(projector->intrinsics);
-
-  const auto sight = [](const CalibratedView& view, const Eigen::Vector2d& ray, double sigma_px) {
-    const Eigen::Matrix3d world_from_camera = view.camera_from_world.linear().transpose();
-    return Sight{view.center(), world_from_camera * ray.homogeneous(), sigma_px / view.intrinsics.fx,
-                 view.intrinsics.fx, world_from_camera.col(2)};
+  std::optional<Source> lights;
+  if (projector != nullptr) {
+    const Eigen::AlignedBox2d whole(Eigen::Vector2d::Zero(), Eigen::Vector2d(width, height));
+    lights.emplace(Source{View(*projector), RayTable(*projector, whole), {}});
+  }
+  const auto sight = [](const Source& source, const Eigen::Vector2d& pixel, double sigma_px) {
+    return Sight{&source.view, source.rays.at(pixel), sigma_px / source.view.focal};
+  };
+  const auto sights_of = [&](int x, int y, std::vector<Sight>* sights) {
+    sights->clear();
+    for (const Source& source : sources)
+      if (const float* at = source.map.pixel(x, y); !std::isnan(at[0]))
+        sights->push_back(sight(source, Eigen::Vector2d(at[0], at[1]), at[2]));
   };
 
   // A subject that moves is lit elsewhere when its rows are shown than when its columns are. Cameras have been brought
@@ -182,9 +216,7 @@ Result<RangeScan> triangulate(const Rig& rig, std::span<const ProjectorCoordinat
     for (int y = 0; y < height; y += stride)
       for (int x = 0; x < width; x += stride) {
         std::vector<Sight> sights;
-        for (const Source& source : sources)
-          if (const float* at = source.map.pixel(x, y); at[0] == at[0])
-            sights.push_back(sight(*source.camera, source.rays.at(Eigen::Vector2d(at[0], at[1])), at[2]));
+        sights_of(x, y, &sights);
         const auto found = sights.size() < 2 ? std::nullopt : meet(sights);
         if (!found || found->residual_px > options.most_residual_px) continue;
         const auto lit = project(*projector, found->point);
@@ -206,16 +238,10 @@ Result<RangeScan> triangulate(const Rig& rig, std::span<const ProjectorCoordinat
     std::vector<Sight> sights;
     for (int y = static_cast<int>(begin); y < static_cast<int>(end) && !work.stopped(); ++y)
       for (int x = 0; x < width; ++x) {
-        sights.clear();
-        for (const Source& source : sources) {
-          const float* at = source.map.pixel(x, y);
-          if (at[0] == at[0])
-            sights.push_back(sight(*source.camera, source.rays.at(Eigen::Vector2d(at[0], at[1])), at[2]));
-        }
+        sights_of(x, y, &sights);
         if (sights.empty()) continue;
         constexpr double projector_sigma_px = 0.02;  // the pixel is exact; its calibration is not
-        if (projector != nullptr)
-          sights.push_back(sight(*projector, projector_rays->at(Eigen::Vector2d(x, y) + lit_off), projector_sigma_px));
+        if (lights) sights.push_back(sight(*lights, Eigen::Vector2d(x, y) + lit_off, projector_sigma_px));
         if (sights.size() < 2) continue;
         auto found = meet(sights);
         if (sights.size() > 2 && (!found || found->residual_px > options.most_residual_px)) {
