@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <bit>
 #include <cmath>
+#include <cstring>
+#include <numbers>
 
 #include "pipeline/structured_light/vector_clones.h"
 
@@ -12,99 +14,237 @@ namespace {
 constexpr int size = TileRow::size;
 constexpr int widest = 2;         // radius of the widest window that a dim pixel is averaged over
 constexpr float certain_snr = 4;  // above that a pixel is read by itself
-using Row16 = TileRow::PerPixel<int16_t>;
-using RowFloat = TileRow::PerPixel<float>;
-using RowFlag = TileRow::PerPixel<uint8_t>;
 
-/// A bit's difference, summed over the window of `radius` around the pixels from (x, y) on; beyond the images their
-/// rims go on. Where one of its images is missing, the pixel's own difference from `sum`, that of lit and unlit.
+// One value a pixel of a tile's row; compilers make of them what registers the processor has.
+using Bytes [[gnu::vector_size(size)]] = uint8_t;
+using Shorts [[gnu::vector_size(2 * size)]] = int16_t;
+using HalfBytes [[gnu::vector_size(size / 2)]] = uint8_t;
+using HalfShorts [[gnu::vector_size(size)]] = int16_t;
+using HalfCodes [[gnu::vector_size(size)]] = uint16_t;
+using Codes [[gnu::vector_size(2 * size)]] = uint16_t;
+// Of half of the pixels: wider ones compilers take apart.
+using Ints [[gnu::vector_size(2 * size)]] = int32_t;
+using Floats [[gnu::vector_size(2 * size)]] = float;
+
+template <class From, class To>
+[[gnu::always_inline]] inline void load(const From* from, To* to) {
+  std::memcpy(to, from, sizeof(To));
+}
+[[gnu::always_inline]] inline void load_bytes(const uint8_t* from, Shorts* to) {
+  Bytes bytes;
+  load(from, &bytes);
+  *to = __builtin_convertvector(bytes, Shorts);
+}
+template <class Vector, class Value>
+[[gnu::always_inline]] inline void store(const Vector& from, Value* to) {
+  std::memcpy(to, &from, sizeof(Vector));
+}
+/// Where `mask` is not 0, `from`.
+template <class Vector, class Value>
+[[gnu::always_inline]] inline void store_where(const Vector& mask, const Vector& from, Value* to) {
+  Vector before;
+  load(to, &before);
+  store((from & mask) | (before & ~mask), to);
+}
+using WideFloats = std::array<Floats, 2>;
+using WideInts = std::array<Ints, 2>;
+
+template <class Half, class Narrow>
+[[gnu::always_inline]] inline void widen(const Narrow& from, WideFloats* to) {
+  std::array<Half, 2> halves;
+  std::memcpy(halves.data(), &from, sizeof(from));
+  for (size_t i = 0; i < 2; ++i) (*to)[i] = __builtin_convertvector(__builtin_convertvector(halves[i], Ints), Floats);
+}
+[[gnu::always_inline]] inline void narrow(const WideInts& from, Shorts* to) {
+  std::array<HalfShorts, 2> halves;
+  for (size_t i = 0; i < 2; ++i) halves[i] = __builtin_convertvector(from[i], HalfShorts);
+  std::memcpy(to, halves.data(), sizeof(*to));
+}
+[[gnu::always_inline]] inline bool any(const Shorts& mask) {
+  std::array<uint64_t, sizeof(Shorts) / sizeof(uint64_t)> words;
+  std::memcpy(words.data(), &mask, sizeof(mask));
+  uint64_t all = 0;
+  for (const uint64_t word : words) all |= word;
+  return all != 0;
+}
+
+/// All bits' differences in a tile and around it, beside each other: in the images they lie so far apart that the
+/// processor's caches keep few of them. Beyond the images their rims go on.
+struct TileDifferences {
+  static constexpr int margin = widest;
+  static constexpr int columns = size + 8;  ///< with both margins, and some to make it vectors of eight
+  static constexpr int rows = size + 2 * margin;
+  template <class Value, int width>
+  using Row = std::array<Value, static_cast<size_t>(width)>;
+
+  /// Of pattern and inverse. Where one of them is missing, of the other from the mean of lit and unlit, doubled.
+  using Bit = std::array<Row<int16_t, columns>, static_cast<size_t>(rows)>;
+  std::array<Bit, 2 * most_bits + 1> bits;  ///< columns', rows', lit and unlit
+  size_t count = 0;
+  /// How much the coarse bits' sums of pattern and inverse differ from the reference's: total, and that of the squares.
+  std::array<Row<int16_t, size>, static_cast<size_t>(size)> drift;
+  std::array<Row<float, size>, static_cast<size_t>(size)> drift2;
+};
+
+/// A bit's difference, summed over the window of `radius` around the pixels of a row.
 template <int radius>
-[[gnu::always_inline]] inline void window_differences(const PatternImages& s, const BitImages& bit, int x, int y,
-                                                      const Row16& sum, Row16* out) {
-  constexpr int window = (2 * radius + 1) * (2 * radius + 1);
-  if (bit.complete() && radius == 0) {
-    const uint8_t *p = bit.pattern.row(y) + x, *q = bit.inverse.row(y) + x;
-    for (int i = 0; i < size; ++i) (*out)[i] = static_cast<int16_t>(p[i] - q[i]);
-  } else if (bit.complete()) {
-    constexpr int columns = size + 8;  // the window's margins, and some to make it vectors of eight
-    std::array<int16_t, columns> column_sums{};
-    const bool interior = x >= radius && x - radius + columns <= s.width;
-    for (int v = -radius; v <= radius; ++v) {
-      const int row = std::clamp(y + v, 0, s.height - 1);
-      const uint8_t *p = bit.pattern.row(row), *q = bit.inverse.row(row);
-      if (interior) {
-        for (int i = 0; i < columns; ++i)
-          column_sums[i] = static_cast<int16_t>(column_sums[i] + p[x - radius + i] - q[x - radius + i]);
-      } else {
-        for (int i = 0; i < columns; ++i) {
-          const int column = std::clamp(x - radius + i, 0, s.width - 1);
-          column_sums[i] = static_cast<int16_t>(column_sums[i] + p[column] - q[column]);
-        }
-      }
-    }
-    for (int i = 0; i < size; ++i) {
-      int total = 0;
-      for (int u = 0; u <= 2 * radius; ++u) total += column_sums[i + u];
-      (*out)[i] = static_cast<int16_t>(total);
-    }
-  } else if (bit.pattern) {
-    const uint8_t* p = bit.pattern.row(y) + x;
-    for (int i = 0; i < size; ++i) (*out)[i] = static_cast<int16_t>(window * (2 * p[i] - sum[i]));
-  } else if (bit.inverse) {
-    const uint8_t* q = bit.inverse.row(y) + x;
-    for (int i = 0; i < size; ++i) (*out)[i] = static_cast<int16_t>(window * (sum[i] - 2 * q[i]));
-  } else {
-    out->fill(0);
+[[gnu::always_inline]] inline void window_differences(const TileDifferences::Bit& bit, int row, Shorts* out) {
+  constexpr int margin = TileDifferences::margin;
+  const auto* line = bit.data() + row + margin;
+  if (radius == 0) {
+    load(line->data() + margin, out);
+    return;
+  }
+  Shorts low{};
+  HalfShorts high{};
+  for (int v = -radius; v <= radius; ++v) {
+    Shorts more_low;
+    HalfShorts more_high;
+    load(line[v].data(), &more_low);
+    load(line[v].data() + size, &more_high);
+    low += more_low;
+    high += more_high;
+  }
+  TileDifferences::Row<int16_t, TileDifferences::columns> sums;
+  std::memcpy(sums.data(), &low, sizeof(low));
+  std::memcpy(sums.data() + size, &high, sizeof(high));
+  *out = Shorts{};
+  for (int u = -radius; u <= radius; ++u) {
+    Shorts shifted;
+    load(sums.data() + margin + u, &shifted);
+    *out += shifted;
   }
 }
 
-/// Mean of the absolute window differences of the coarse bits.
-template <int radius>
-[[gnu::always_inline]] inline void mean_strengths(const PatternImages& s, std::span<const BitImages* const> coarse,
-                                                  int x, int y, const Row16& sum, RowFloat* mean) {
-  std::array<int32_t, size> strength{};
-  for (const BitImages* bit : coarse) {
-    Row16 d;
-    window_differences<radius>(s, *bit, x, y, sum, &d);
-    for (int i = 0; i < size; ++i) strength[i] += std::abs(d[i]);
+/// The differences of a bit around the tile at (x, y).
+[[gnu::always_inline]] inline void subtract(const PatternImages& s, const BitImages& reference, const BitImages& bit,
+                                            int x, int y, TileDifferences::Bit* to) {
+  constexpr int margin = TileDifferences::margin, columns = TileDifferences::columns;
+  const bool interior = x >= margin && x - margin + columns <= s.width;
+  const PixelView& own = bit.pattern ? bit.pattern : bit.inverse;
+  const int16_t sign = bit.pattern ? 1 : -1;
+  for (int v = 0; v < TileDifferences::rows; ++v) {
+    const int row = std::clamp(y + v - margin, 0, s.height - 1);
+    auto& values = (*to)[static_cast<size_t>(v)];
+    if (!interior) {
+      for (int u = 0; u < columns; ++u) {
+        const int column = std::clamp(x + u - margin, 0, s.width - 1);
+        values[u] =
+            static_cast<int16_t>(bit.complete() ? bit.pattern.at(column, row) - bit.inverse.at(column, row)
+                                                : sign * (2 * own.at(column, row) - reference.sum(column, row)));
+      }
+      continue;
+    }
+    const auto fill = [&]<class Raw, class Wide>(int first, const Raw&, Wide& wide) __attribute__((always_inline)) {
+      const auto get = [&](const PixelView& image, Wide* pixels) __attribute__((always_inline)) {
+        Raw bytes;
+        load(image.row(row) + x - margin + first, &bytes);
+        *pixels = __builtin_convertvector(bytes, Wide);
+      };
+      Wide lit, unlit;
+      if (bit.complete()) {
+        get(bit.pattern, &lit);
+        get(bit.inverse, &unlit);
+        wide = lit - unlit;
+      } else {
+        get(own, &wide);
+        get(reference.pattern, &lit);
+        get(reference.inverse, &unlit);
+        wide = sign * (wide + wide - lit - unlit);
+      }
+      store(wide, values.data() + first);
+    };
+    Shorts low;
+    HalfShorts high;
+    fill(0, Bytes{}, low);
+    fill(size, HalfBytes{}, high);
+    constexpr int cache_line = 64;  // the next tiles' pixels: rows lie too far apart for processors to see them coming
+    __builtin_prefetch(own.row(row) + x + cache_line);
+    if (bit.inverse) __builtin_prefetch(bit.inverse.row(row) + x + cache_line);
   }
-  const float scale = 1.0F / static_cast<float>(std::max<size_t>(coarse.size(), 1));
-  for (int i = 0; i < size; ++i) (*mean)[i] = scale * static_cast<float>(strength[i]);
+}
+
+/// @param coarse  whose stripes are wide, of the bits in the order of TileDifferences
+BOOTH_VECTOR_CLONES
+void subtract_all(const PatternImages& s, const BitImages& reference, std::span<const uint8_t> coarse, int x, int y,
+                  TileDifferences* tile) {
+  tile->count = 0;
+  for (auto& row : tile->drift) row.fill(0);
+  for (auto& row : tile->drift2) row.fill(0);
+  const auto sum_of = [&](const BitImages& pair, int row, Shorts* sum) __attribute__((always_inline)) {
+    Shorts lit, unlit;
+    load_bytes(pair.pattern.row(row) + x, &lit);
+    load_bytes(pair.inverse.row(row) + x, &unlit);
+    *sum = lit + unlit;
+  };
+  const auto add = [&](const BitImages& bit) __attribute__((always_inline)) {
+    const bool is_coarse = coarse[tile->count] != 0;
+    TileDifferences::Bit& to = tile->bits[tile->count++];
+    if (bit.missing()) {
+      for (auto& row : to) row.fill(0);
+      return;
+    }
+    subtract(s, reference, bit, x, y, &to);
+    for (int v = 0; v < size && is_coarse; ++v) {
+      const int row = std::min(y + v, s.height - 1);
+      Shorts sum, own, drift;
+      sum_of(reference, row, &sum);
+      sum_of(bit, row, &own);
+      own -= sum;
+      load(tile->drift[v].data(), &drift);
+      store(drift + own, tile->drift[v].data());
+      WideFloats wide, drift2;
+      widen<HalfShorts>(own, &wide);
+      load(tile->drift2[v].data(), &drift2);
+      for (size_t i = 0; i < 2; ++i) drift2[i] += wide[i] * wide[i];
+      store(drift2, tile->drift2[v].data());
+    }
+  };
+  for (const auto& bits : s.bits)
+    for (const BitImages& bit : bits) add(bit);
+  if (s.lit_and_unlit.complete()) add(s.lit_and_unlit);
 }
 
 /// Reads all bits of the pixels that are chosen, averaged over the window of `radius`.
 /// @param contrast  mean strength, summed over the window as the differences are
+/// @param chosen    -1 where, else 0
 template <int radius>
-[[gnu::always_inline]] inline void read_bits(const PatternImages& s, int x, int y, const Row16& sum,
-                                             const RowFloat& contrast, const RowFlag& chosen, TileRow* out) {
-  RowFloat scale;
-  for (int i = 0; i < size; ++i) scale[i] = static_cast<float>(relative_unit) / std::max(contrast[i], 1e-6F);
-  // Beyond the contrast there is noise alone.
-  constexpr float most = 1.25F * static_cast<float>(relative_unit);
+[[gnu::always_inline]] inline void read_bits(const PatternImages& s, const TileDifferences& tile, int row,
+                                             const WideFloats& contrast, const Shorts& chosen, TileRow* out) {
+  constexpr float unit = relative_unit, most = 1.25F * unit;  // beyond the contrast there is noise alone
+  const WideFloats scale{unit / contrast[0], unit / contrast[1]};
+  const TileDifferences::Bit* next = tile.bits.data();
   for (size_t axis = 0; axis < 2; ++axis) {
     const std::vector<BitImages>& bits = s.bits[axis];
     const size_t count = bits.size();
     TileRow::Axis& to = out->axis[axis];
-    std::array<Row16, 16> relative;  // from the finest
-    TileRow::PerPixel<uint16_t> code{};
+    std::array<TileRow::PerPixel<int16_t>, most_bits> differences;  // from the finest
+    const auto relative = [&](const Shorts& d, Shorts* to_units) __attribute__((always_inline)) {
+      WideFloats wide;
+      widen<HalfShorts>(d, &wide);
+      WideInts units;
+      for (size_t i = 0; i < 2; ++i) {
+        wide[i] *= scale[i];
+        wide[i] = wide[i] < most ? wide[i] : Floats{} + most;
+        wide[i] = wide[i] > -most ? wide[i] : Floats{} - most;
+        units[i] = __builtin_convertvector(wide[i], Ints);
+      }
+      narrow(units, to_units);
+    };
+    Codes code{};
     for (size_t bit = count; bit-- > 0;) {
-      Row16 d;
-      window_differences<radius>(s, bits[count - 1 - bit], x, y, sum, &d);
-      for (int i = 0; i < size; ++i) code[i] = static_cast<uint16_t>(code[i] << 1 | (d[i] > 0 ? 1 : 0));
-      for (int i = 0; i < size; ++i)
-        relative[bit][i] = static_cast<int16_t>(std::min(std::max(static_cast<float>(d[i]) * scale[i], -most), most));
+      Shorts d;
+      window_differences<radius>(*next++, row, &d);
+      const Shorts set = d > 0;
+      code = code + code - reinterpret_cast<Codes>(set);
+      store(d, differences[bit].data());
+      if (bit >= static_cast<size_t>(fine_bits)) continue;
+      Shorts in_units;
+      relative(d, &in_units);
+      store_where(chosen, in_units, to.relative[bit].data());
     }
-    for (int i = 0; i < size; ++i) {  // a Gray bit is the binary bit's change from the one before it
-      unsigned value = code[i];
-      value ^= value >> 8;
-      value ^= value >> 4;
-      value ^= value >> 2;
-      value ^= value >> 1;
-      code[i] = static_cast<uint16_t>(value);
-    }
-    for (int i = 0; i < size; ++i) to.code[i] = chosen[i] != 0 ? code[i] : to.code[i];
-    for (size_t bit = 0; bit < std::min<size_t>(fine_bits, count); ++bit)
-      for (int i = 0; i < size; ++i) to.relative[bit][i] = chosen[i] != 0 ? relative[bit][i] : to.relative[bit][i];
+    for (const int shift : {8, 4, 2, 1}) code ^= code >> shift;  // a Gray bit is the binary bit's change
+    store_where(reinterpret_cast<Codes>(chosen), code, to.code.data());
     for (int i = 0; i < size; ++i) {
       if (chosen[i] == 0) continue;
       to.edge[i] = 0;
@@ -114,90 +254,109 @@ template <int radius>
       const auto bit = static_cast<size_t>(std::countr_zero(edge));
       if (bit >= count || bits[count - 1 - bit].missing()) continue;
       const bool rises = ((edge ^ edge >> 1) >> bit & 1U) != 0;
+      const float found = static_cast<float>(differences[bit][i]) * scale[i / (size / 2)][i % (size / 2)];
       to.edge[i] = static_cast<uint16_t>(edge);
-      to.edge_relative[i] = static_cast<int16_t>(rises ? relative[bit][i] : -relative[bit][i]);
+      to.edge_relative[i] = static_cast<int16_t>(std::clamp(rises ? found : -found, -most, most));
     }
   }
+}
+
+/// Mean of the coarse bits' absolute differences, each summed over the window of `radius`.
+template <int radius>
+[[gnu::always_inline]] inline void mean_strength(const TileDifferences& tile, std::span<const uint8_t> coarse,
+                                                 float count, int row, WideFloats* mean) {
+  constexpr int16_t shift = radius == widest ? 2 : 0;  // to keep sums of a window and all bits within 16 bits
+  constexpr int16_t rounding = (1 << shift) / 2;
+  Codes strength{};
+  for (size_t bit = 0; bit < tile.count; ++bit) {
+    if (coarse[bit] == 0) continue;
+    Shorts d;
+    window_differences<radius>(tile.bits[bit], row, &d);
+    const Shorts negative = -d;
+    d = ((d > negative ? d : negative) + rounding) >> shift;
+    strength += reinterpret_cast<Codes>(d);
+  }
+  widen<HalfCodes>(strength, mean);
+  for (Floats& values : *mean) values *= (1 << shift) / count;
 }
 
 /// Averages what is left over the window of `radius` and reads the pixels that this makes sure.
+/// @return whether some are left still
 template <int radius>
-[[gnu::always_inline]] inline bool read_dim(const PatternImages& s, std::span<const BitImages* const> coarse,
-                                            float min_snr, int x, int y, const Row16& sum, const RowFloat& variance,
-                                            RowFlag* left, TileRow* out) {
-  RowFloat contrast;
-  mean_strengths<radius>(s, coarse, x, y, sum, &contrast);
+[[gnu::always_inline]] inline bool read_dim(const PatternImages& s, const TileDifferences& tile,
+                                            std::span<const uint8_t> coarse, float count, float min_snr, int row,
+                                            const WideFloats& variance, Shorts* left, TileRow* out) {
+  WideFloats contrast;
+  mean_strength<radius>(tile, coarse, count, row, &contrast);
   constexpr float width = 2 * radius + 1, window = width * width;
-  RowFlag chosen;
-  int found = 0, remaining = 0;
-  for (int i = 0; i < size; ++i) {
-    const float snr2 = contrast[i] * contrast[i] / (window * window * variance[i]);
-    chosen[i] = (*left)[i] != 0 && snr2 * window >= min_snr * min_snr ? 1 : 0;
-    if (chosen[i] != 0) out->snr2[i] = snr2;
-    found += chosen[i];
-    (*left)[i] = static_cast<uint8_t>((*left)[i] - chosen[i]);
-    remaining += (*left)[i];
-    out->lit[i] = static_cast<uint8_t>(out->lit[i] + chosen[i]);
+  WideFloats snr2;
+  WideInts enough;
+  for (size_t i = 0; i < 2; ++i) {
+    snr2[i] = contrast[i] * contrast[i] / (window * window * variance[i]);
+    enough[i] = snr2[i] * window >= min_snr * min_snr;
   }
-  if (found > 0) read_bits<radius>(s, x, y, sum, contrast, chosen, out);
-  return remaining > 0;
+  Shorts chosen;
+  narrow(enough, &chosen);
+  chosen &= *left;
+  if (any(chosen)) {
+    for (int i = 0; i < size; ++i)
+      if (chosen[i] != 0) out->snr2[i] = snr2[i / (size / 2)][i % (size / 2)];
+    Shorts lit;
+    load(out->lit.data(), &lit);
+    store(lit | chosen, out->lit.data());
+    read_bits<radius>(s, tile, row, contrast, chosen, out);
+    *left &= ~chosen;
+  }
+  return any(*left);
 }
 
 BOOTH_VECTOR_CLONES
-void read_tile_row(const PatternImages& s, const BitImages& reference, std::span<const BitImages* const> coarse,
-                   float min_snr, float overall_variance, int x, int y, TileRow* out) {
-  // Sums over the coarse bits, whose stripes are wide: how strong their differences are, and how much the sums of
-  // pattern and inverse vary, which would all be the same without noise.
-  Row16 sum{}, strength{}, drift{};
-  std::array<int32_t, size> drift2{};
-  if (reference.complete()) {
-    const uint8_t *p = reference.pattern.row(y) + x, *q = reference.inverse.row(y) + x;
-    for (int i = 0; i < size; ++i) sum[i] = static_cast<int16_t>(p[i] + q[i]);
-  }
-  for (const BitImages* bit : coarse) {
-    const uint8_t *p = bit->pattern.row(y) + x, *q = bit->inverse.row(y) + x;
-    for (int i = 0; i < size; ++i) {
-      const int off = p[i] + q[i] - sum[i];
-      strength[i] = static_cast<int16_t>(strength[i] + std::abs(p[i] - q[i]));
-      drift[i] = static_cast<int16_t>(drift[i] + off);
-      drift2[i] += off * off;
-    }
-  }
+void read_row(const PatternImages& s, const TileDifferences& tile, std::span<const uint8_t> coarse, float min_snr,
+              float overall_variance, int row, TileRow* out) {
+  const auto coarse_bits = std::count_if(coarse.begin(), coarse.end(), [](uint8_t is) { return is != 0; });
+  const float count = static_cast<float>(std::max<std::ptrdiff_t>(coarse_bits, 1));
   // The variance of a bit's difference at a pixel (a difference and a sum of two images have the same noise), steadied
   // by that of the whole image.
   constexpr float overall_weight = 6;  // as many samples
-  const float count = static_cast<float>(std::max<size_t>(coarse.size(), 1));
-  RowFloat variance, contrast;
-  RowFlag left;
-  int certain = 0;
-  for (int i = 0; i < size; ++i) {
-    const float mean = static_cast<float>(drift[i]) / count;
-    const float scatter = static_cast<float>(drift2[i]) - mean * mean * count;
+  Shorts drift;
+  load(tile.drift[row].data(), &drift);
+  WideFloats mean, drift2, contrast, variance, snr2;
+  widen<HalfShorts>(drift, &mean);
+  load(tile.drift2[row].data(), &drift2);
+  mean_strength<0>(tile, coarse, count, row, &contrast);
+  WideInts sure;
+  for (size_t i = 0; i < 2; ++i) {
+    mean[i] /= count;
+    const Floats scatter = drift2[i] - mean[i] * mean[i] * count;
     variance[i] = (overall_weight * overall_variance + scatter) / (overall_weight + count - 1);
-    contrast[i] = static_cast<float>(strength[i]) / count;
-    out->snr2[i] = contrast[i] * contrast[i] / variance[i];
-    out->lit[i] = out->snr2[i] >= certain_snr * certain_snr ? 1 : 0;
-    left[i] = static_cast<uint8_t>(1 - out->lit[i]);
-    certain += out->lit[i];
+    snr2[i] = contrast[i] * contrast[i] / variance[i];
+    sure[i] = snr2[i] >= certain_snr * certain_snr;
   }
-  if (certain > 0) read_bits<0>(s, x, y, sum, contrast, out->lit, out);
-  if (certain == size) return;
-  if (s.lit_and_unlit.complete()) {
+  Shorts certain;
+  narrow(sure, &certain);
+  store(snr2, out->snr2.data());
+  store(certain, out->lit.data());
+  if (any(certain)) read_bits<0>(s, tile, row, contrast, certain, out);
+  Shorts left = ~certain;
+  if (s.lit_and_unlit.complete() && any(left)) {
     // Nothing around the pixel is lit by half of what is asked for.
     constexpr float share = 0.5F, width = 2 * widest + 1;
-    Row16 d;
-    window_differences<widest>(s, s.lit_and_unlit, x, y, sum, &d);
-    int hopeful = 0;
-    for (int i = 0; i < size; ++i) {
-      const float mean = std::max(static_cast<float>(d[i]), 0.0F) / (width * width);
-      const float least = share * min_snr / width;
-      left[i] = left[i] != 0 && mean * mean >= least * least * variance[i] ? 1 : 0;
-      hopeful += left[i];
+    Shorts d;
+    window_differences<widest>(tile.bits[tile.count - 1], row, &d);
+    WideFloats around;
+    widen<HalfShorts>(d, &around);
+    const float least = share * min_snr / width;
+    WideInts hopeful;
+    for (size_t i = 0; i < 2; ++i) {
+      around[i] /= width * width;
+      hopeful[i] = (around[i] > 0) & (around[i] * around[i] >= least * least * variance[i]);
     }
-    if (hopeful == 0) return;
+    Shorts kept;
+    narrow(hopeful, &kept);
+    left &= kept;
   }
-  if (read_dim<1>(s, coarse, min_snr, x, y, sum, variance, &left, out))
-    read_dim<widest>(s, coarse, min_snr, x, y, sum, variance, &left, out);
+  if (any(left) && read_dim<1>(s, tile, coarse, count, min_snr, row, variance, &left, out))
+    read_dim<widest>(s, tile, coarse, count, min_snr, row, variance, &left, out);
 }
 
 }  // namespace
@@ -206,12 +365,10 @@ BitReader::BitReader(const PatternImages& images, double min_snr)
     : s_(images), reference_(images.lit_and_unlit), min_snr_(static_cast<float>(min_snr)) {
   for (const auto& bits : s_.bits)
     for (size_t bit = 0; bit < bits.size(); ++bit) {
-      all_.push_back(&bits[bit]);
-      if (!bits[bit].complete()) continue;
       if (!reference_.complete()) reference_ = bits[bit];
-      if (bit + fine_bits < bits.size()) coarse_.push_back(&bits[bit]);
+      coarse_.push_back(bits[bit].complete() && bit + fine_bits < bits.size() ? 1 : 0);
     }
-  if (s_.lit_and_unlit.complete()) coarse_.push_back(&s_.lit_and_unlit);
+  if (s_.lit_and_unlit.complete()) coarse_.push_back(1);
   noise_ = measure_noise();
 }
 
@@ -229,8 +386,9 @@ Result<void> BitReader::check() const {
 double BitReader::measure_noise() const {
   constexpr double assumed_noise = 2;  // grey levels, where it cannot be measured
   std::vector<const BitImages*> pairs;
-  std::copy_if(all_.begin(), all_.end(), std::back_inserter(pairs),
-               [](const BitImages* bit) { return bit->complete(); });
+  for (const auto& bits : s_.bits)
+    for (const BitImages& bit : bits)
+      if (bit.complete()) pairs.push_back(&bit);
   if (pairs.size() < 2) return assumed_noise;
   constexpr int stride = 4;
   std::vector<int> spread;
@@ -248,8 +406,40 @@ double BitReader::measure_noise() const {
   return std::max(0.3, (*middle + 0.5) / normal_mad / std::sqrt(images_in_change));
 }
 
-void BitReader::read(int x, int y, TileRow* row) const {
-  read_tile_row(s_, reference_, coarse_, min_snr_, static_cast<float>(2 * noise_ * noise_), x, y, row);
+std::optional<std::array<double, 2>> BitReader::finest_strength() const {
+  std::vector<const BitImages*> coarse;
+  if (s_.lit_and_unlit.complete()) coarse.push_back(&s_.lit_and_unlit);  // which most often tells that a pixel is dark
+  size_t next = 0;
+  for (const auto& bits : s_.bits)
+    for (const BitImages& bit : bits)
+      if (coarse_[next++] != 0) coarse.push_back(&bit);
+  const double least = certain_snr * std::numbers::sqrt2 * noise_;
+  std::array<double, 2> sum{};
+  size_t count = 0;
+  constexpr int stride = 4;
+  for (int y = 0; y < s_.height && !coarse.empty(); y += stride)
+    for (int x = 0; x < s_.width; x += stride) {
+      if (coarse.front()->contrast(x, y) < 0.5 * least) continue;
+      int total = 0;
+      for (const BitImages* bit : coarse) total += bit->contrast(x, y);
+      const double contrast = static_cast<double>(total) / static_cast<double>(coarse.size());
+      if (contrast < least) continue;
+      ++count;
+      for (size_t axis = 0; axis < 2; ++axis)
+        if (const BitImages& finest = s_.bits[axis].back(); finest.complete())
+          sum[axis] += std::min(finest.contrast(x, y) / contrast, 1.25);
+    }
+  if (count == 0) return std::nullopt;
+  for (double& total : sum) total /= static_cast<double>(count);
+  return sum;
+}
+
+void BitReader::read(int x, int y, TileRead* read) const {
+  TileDifferences tile;
+  subtract_all(s_, reference_, coarse_, x, y, &tile);
+  const float variance = static_cast<float>(2 * noise_ * noise_);
+  for (int row = 0; row < std::min(size, s_.height - y); ++row)
+    read_row(s_, tile, coarse_, min_snr_, variance, row, &(*read)[static_cast<size_t>(row)]);
 }
 
 }  // namespace booth

@@ -2,6 +2,8 @@
 
 #include <array>
 #include <cstdint>
+#include <optional>
+#include <vector>
 
 #include "pipeline/structured_light/pattern_images.h"
 
@@ -16,7 +18,7 @@ struct TileRow {
   template <class T>
   using PerPixel = std::array<T, static_cast<size_t>(size)>;
 
-  PerPixel<uint8_t> lit;  ///< 0: too dim, the rest is meaningless
+  PerPixel<int16_t> lit;  ///< 0: too dim, the rest is meaningless; -1 otherwise
   PerPixel<float> snr2;   ///< square of the contrast by the standard deviation of a bit's difference at that pixel
   struct Axis {
     PerPixel<uint16_t> code;                                                 ///< projector pixel by all bits' signs
@@ -28,6 +30,8 @@ struct TileRow {
   };
   std::array<Axis, 2> axis;
 };
+
+using TileRead = std::array<TileRow, static_cast<size_t>(TileRow::size)>;
 
 /// Reads the bits of pixels and how sure they are. What is too dim by itself (dark skin and hair, grazing light) is
 /// averaged with its surroundings as far as the noise asks for.
@@ -41,21 +45,18 @@ class BitReader {
   Result<void> check() const;
   /// The standard deviation of one image, grey levels, from how much the sums of pattern and inverse differ.
   double noise() const { return noise_; }
-  /// The pixels from (x, y) on, which must all lie in the images.
-  void read(int x, int y, TileRow* row) const;
+  /// Mean of the finest bits' absolute difference relative to the contrast, columns' and rows', over some of the pixels
+  /// that are sure; nothing where there are none. 0 for a bit that is not complete.
+  std::optional<std::array<double, 2>> finest_strength() const;
+  /// The tile whose first pixel is (x, y): all its columns and those of its rows that lie in the images.
+  void read(int x, int y, TileRead* read) const;
 
  private:
-  static constexpr int size = TileRow::size;
-  static constexpr size_t most_bits = 32;  // of both axes
-  struct Differences;
-  struct Strengths;
-
   double measure_noise() const;
 
   const PatternImages& s_;
-  std::vector<const BitImages*> all_;     ///< columns' bits, then rows'
-  std::vector<const BitImages*> coarse_;  ///< complete ones whose stripes are wide, lit and unlit among them
-  BitImages reference_;                   ///< what a pattern alone is compared with: lit and unlit, or another pair
+  std::vector<uint8_t> coarse_;  ///< 1 for complete bits whose stripes are wide: columns', rows', lit and unlit
+  BitImages reference_;          ///< what a pattern alone is compared with: lit and unlit, or another pair
   float min_snr_;
   double noise_;
 };

@@ -17,8 +17,6 @@
 namespace booth {
 namespace {
 
-constexpr size_t row_grain = 16;  // rows in a piece of parallel work
-
 /// Leaves out the tiles that are not in or near the subject; the margin leaves room for its movement since it was
 /// segmented.
 void keep_near(const Image& subject, SearchTiles* tiles) {
@@ -64,9 +62,9 @@ class Decoder {
     const std::array<double, 2> blurs = measure_blur();
     out->blur_px = blurs[1];
     const std::array<StripeProfiles, 2> profiles{StripeProfiles(blurs[0]), StripeProfiles(blurs[1])};
-    std::vector<size_t> lit(static_cast<size_t>(s_.height), 0);
-    work_.parallel_for(lit.size(), row_grain, [&](size_t begin, size_t end) {
-      for (size_t y = begin; y < end && !work_.stopped(); ++y) lit[y] = place_row(static_cast<int>(y), profiles);
+    std::vector<size_t> lit(tile_rows(), 0);
+    work_.parallel_for(lit.size(), 1, [&](size_t begin, size_t end) {
+      for (size_t row = begin; row < end && !work_.stopped(); ++row) lit[row] = place(static_cast<int>(row), profiles);
     });
     if (work_.stopped()) return Work::cancelled();
     if (std::accumulate(lit.begin(), lit.end(), size_t{0}) < fewest_lit)
@@ -76,10 +74,10 @@ class Decoder {
     out->position = FloatImage(s_.width, s_.height, 2, std::numeric_limits<float>::quiet_NaN());
     out->sigma = FloatImage(s_.width, s_.height, 1, std::numeric_limits<float>::infinity());
     const PositionFit fit(raw_);
-    work_.parallel_for(lit.size(), row_grain, [&](size_t begin, size_t end) {
-      for (size_t y = begin; y < end && !work_.stopped(); ++y)
-        for_each_tile(static_cast<int>(y), [&](int x, const Eigen::AlignedBox2i&) {
-          fit.fit(static_cast<int>(y), x, x + TileRow::size, out);
+    work_.parallel_for(lit.size(), 1, [&](size_t begin, size_t end) {
+      for (size_t row = begin; row < end && !work_.stopped(); ++row)
+        for_each_tile(static_cast<int>(row), [&](int x, int y, const Eigen::AlignedBox2i&) {
+          for (int v = y; v < std::min(y + TileRow::size, s_.height); ++v) fit.fit(v, x, x + TileRow::size, out);
         });
     });
     if (work_.stopped()) return Work::cancelled();
@@ -89,64 +87,60 @@ class Decoder {
   }
 
  private:
-  /// Calls `visit` with the first pixel of each tile that is looked for in a row of the images, and what can light it.
-  /// Tiles that reach over the images' rim begin where they end with it.
+  /// Rows of tiles; the images begin with one.
+  size_t tile_rows() const { return static_cast<size_t>((s_.height + TileRow::size - 1) / TileRow::size); }
+
+  /// Calls `visit` with the first pixel of each tile that is looked for in a row of tiles, and what can light it. Tiles
+  /// that reach over the images' right rim begin where they end with it.
   template <class Visitor>
-  void for_each_tile(int y, const Visitor& visit) const {
-    const int row = (s_.origin.y() + y) / SearchTiles::size_px, first = s_.origin.x() / SearchTiles::size_px;
+  void for_each_tile(int row, const Visitor& visit) const {
+    const Eigen::Vector2i first = s_.origin / SearchTiles::size_px;
     for (int x = 0; x < s_.width; x += TileRow::size)
-      if (const Eigen::AlignedBox2i& lit_from = tiles_.at(first + x / TileRow::size, row); !lit_from.isEmpty())
-        visit(std::min(x, s_.width - TileRow::size), lit_from);
+      if (const auto& lit_from = tiles_.at(first.x() + x / TileRow::size, first.y() + row); !lit_from.isEmpty())
+        visit(std::min(x, s_.width - TileRow::size), row * TileRow::size, lit_from);
   }
 
-  /// By the mean strength of the finest stripes where pixels are sure, columns' and rows'.
+  /// By the mean strength of the finest stripes, columns' and rows'; one of them tells for the other.
   std::array<double, 2> measure_blur() const {
-    std::array<double, 2> sum{};
-    size_t count = 0;
-    constexpr int stride = 8;  // every eighth row tells enough
-    constexpr float sure_snr = 4;
-    TileRow read;
-    for (int y = 0; y < s_.height; y += stride)
-      for_each_tile(y, [&](int x, const Eigen::AlignedBox2i&) {
-        reader_.read(x, y, &read);
-        for (size_t i = 0; i < static_cast<size_t>(TileRow::size); ++i) {
-          if (read.lit[i] == 0 || read.snr2[i] < sure_snr * sure_snr) continue;
-          ++count;
-          for (size_t axis = 0; axis < 2; ++axis)
-            sum[axis] += std::abs(static_cast<double>(read.axis[axis].relative[0][i])) / relative_unit;
-        }
-      });
     constexpr double usual_blur = 0.6;
+    const auto strength = reader_.finest_strength();
     std::array<double, 2> blur{usual_blur, usual_blur};
-    for (size_t axis = 0; axis < 2; ++axis)
-      if (known_[axis][0] && count > 0) blur[axis] = StripeProfiles::blur_of(sum[axis] / static_cast<double>(count));
+    for (size_t axis = 0; axis < 2 && strength; ++axis) {
+      const double own = (*strength)[axis], other = (*strength)[1 - axis];
+      if (own > 0 || other > 0) blur[axis] = StripeProfiles::blur_of(own > 0 ? own : other);
+    }
     return blur;
   }
 
-  /// Reads and places a row's pixels. Returns how many are lit.
-  size_t place_row(int y, const std::array<StripeProfiles, 2>& profiles) {
+  /// Reads and places the pixels of a row of tiles. Returns how many are lit.
+  size_t place(int row, const std::array<StripeProfiles, 2>& profiles) {
     size_t lit = 0;
-    TileRow read;
-    for_each_tile(y, [&](int x, const Eigen::AlignedBox2i& lit_from) {
+    TileRead read;
+    for_each_tile(row, [&](int x, int y, const Eigen::AlignedBox2i& lit_from) {
       reader_.read(x, y, &read);
-      for (int i = 0; i < TileRow::size; ++i) {
-        if (read.lit[i] == 0) continue;
-        ++lit;
-        const auto at = static_cast<size_t>(raw_.index(x + i, y));
-        raw_.weight[at] = -1;
-        if (!lit_from.contains(Eigen::Vector2i(read.axis[0].code[i], read.axis[1].code[i]))) continue;
-        const auto column = profiles[0].place(read.axis[0], i, known_[0]);
-        const auto row = profiles[1].place(read.axis[1], i, known_[1]);
-        const auto inside = [&](float position, int size) {
-          return position > -0.5F && position < static_cast<float>(size) - 0.5F;
-        };
-        if (!inside(column.position, sizes_[0]) || !inside(row.position, sizes_[1])) continue;
-        raw_.column[at] = column.position;
-        raw_.row[at] = row.position;
-        raw_.weight[at] = std::min(column.information, row.information) * read.snr2[i];
-      }
+      for (int v = 0; v < std::min(TileRow::size, s_.height - y); ++v)
+        for (int u = 0; u < TileRow::size; ++u) {
+          if (read[v].lit[u] == 0) continue;
+          ++lit;
+          place(read[v], u, static_cast<size_t>(raw_.index(x + u, y + v)), lit_from, profiles);
+        }
     });
     return lit;
+  }
+
+  void place(const TileRow& read, int pixel, size_t at, const Eigen::AlignedBox2i& lit_from,
+             const std::array<StripeProfiles, 2>& profiles) {
+    raw_.weight[at] = -1;
+    if (!lit_from.contains(Eigen::Vector2i(read.axis[0].code[pixel], read.axis[1].code[pixel]))) return;
+    const auto column = profiles[0].place(read.axis[0], pixel, known_[0]);
+    const auto row = profiles[1].place(read.axis[1], pixel, known_[1]);
+    const auto inside = [&](float position, int size) {
+      return position > -0.5F && position < static_cast<float>(size) - 0.5F;
+    };
+    if (!inside(column.position, sizes_[0]) || !inside(row.position, sizes_[1])) return;
+    raw_.column[at] = column.position;
+    raw_.row[at] = row.position;
+    raw_.weight[at] = std::min(column.information, row.information) * read.snr2[pixel];
   }
 
   const PatternImages& s_;

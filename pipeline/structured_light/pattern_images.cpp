@@ -8,8 +8,6 @@
 namespace booth {
 namespace {
 
-constexpr size_t most_bits = 16;  // of a coordinate
-
 Image to_grey(const Image& image) {
   Image grey(image.width, image.height, 1);
   const size_t channels = static_cast<size_t>(image.channels);

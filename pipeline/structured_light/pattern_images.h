@@ -17,8 +17,9 @@
 
 namespace booth {
 
-inline constexpr int clearly_lit = 12;  ///< grey levels between a pattern and its inverse
-inline constexpr int fewest_lit = 200;  ///< pixels below which there is nothing to decode
+inline constexpr int clearly_lit = 12;   ///< grey levels between a pattern and its inverse
+inline constexpr size_t most_bits = 16;  ///< of a coordinate
+inline constexpr int fewest_lit = 200;   ///< pixels below which there is nothing to decode
 
 /// Part of a grey image of someone else.
 struct PixelView {

@@ -261,6 +261,8 @@ PositionFit::PositionFit(const RawPositions& raw) : raw_(raw) {
 
 void PositionFit::fit(int y, int first, int last, ProjectorCoordinates* out) const {
   for (int x = first; x < last; x += lanes) {
+    const auto weight = raw_.weight.begin() + raw_.index(x, y);
+    if (std::all_of(weight, weight + lanes, [](float w) { return w == 0; })) continue;
     Fitted fitted;
     fit_block(raw_, raw_.index(x, y), radius_, scale_, &fitted);
     for (int l = 0; l < std::min(lanes, last - x); ++l) {

@@ -5,6 +5,7 @@
 #include <array>
 #include <cmath>
 #include <optional>
+#include <utility>
 
 #include "pipeline/geometry/camera_model.h"
 
@@ -117,12 +118,18 @@ struct Meeting {
 constexpr size_t most_sights = 8;
 
 /// The point of least weighted squared distance to the rays.
-std::optional<Meeting> meet(std::span<const Sight> sights) {
+/// @param near  where it may be, world frame
+std::optional<Meeting> meet(std::span<const Sight> sights, const Eigen::Vector3d& near) {
   Meeting found;
   std::array<double, most_sights> depth;
-  depth.fill(1);
+  for (size_t i = 0; i < sights.size(); ++i) {
+    constexpr double least_m = 0.01;
+    depth[i] = std::max(sights[i].view->axis.dot(near - sights[i].view->center), least_m);
+  }
   Eigen::Matrix3d covariance;
-  for (int pass = 0; pass < 2; ++pass) {  // the depths, which the weights need, are good enough after the first
+  constexpr double good_enough = 0.05;  // of the depths, which the weights need
+  double change = 1;
+  for (int pass = 0; pass < 2 && change > good_enough; ++pass) {
     double xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
     Eigen::Vector3d right = Eigen::Vector3d::Zero();
     for (size_t i = 0; i < sights.size(); ++i) {
@@ -143,9 +150,11 @@ std::optional<Meeting> meet(std::span<const Sight> sights) {
     covariance << a, b, c, b, e, f, c, f, g;
     covariance /= determinant;
     found.point = covariance * right;
+    change = 0;
     for (size_t i = 0; i < sights.size(); ++i) {
-      depth[i] = sights[i].view->axis.dot(found.point - sights[i].view->center);
+      const double before = std::exchange(depth[i], sights[i].view->axis.dot(found.point - sights[i].view->center));
       if (!(depth[i] > 0)) return std::nullopt;
+      change = std::max(change, std::abs(depth[i] - before) / before);
     }
   }
   for (size_t i = 0; i < sights.size(); ++i) {
@@ -217,7 +226,7 @@ Result<RangeScan> triangulate(const Rig& rig, std::span<const ProjectorCoordinat
       for (int x = 0; x < width; x += stride) {
         std::vector<Sight> sights;
         sights_of(x, y, &sights);
-        const auto found = sights.size() < 2 ? std::nullopt : meet(sights);
+        const auto found = sights.size() < 2 ? std::nullopt : meet(sights, rig.volume.center());
         if (!found || found->residual_px > options.most_residual_px) continue;
         const auto lit = project(*projector, found->point);
         if (!lit) continue;
@@ -236,28 +245,31 @@ Result<RangeScan> triangulate(const Rig& rig, std::span<const ProjectorCoordinat
   constexpr size_t row_grain = 16;
   work.parallel_for(static_cast<size_t>(height), row_grain, [&](size_t begin, size_t end) {
     std::vector<Sight> sights;
-    for (int y = static_cast<int>(begin); y < static_cast<int>(end) && !work.stopped(); ++y)
+    for (int y = static_cast<int>(begin); y < static_cast<int>(end) && !work.stopped(); ++y) {
+      Eigen::Vector3d near = rig.volume.center();  // the last point of the row
       for (int x = 0; x < width; ++x) {
         sights_of(x, y, &sights);
         if (sights.empty()) continue;
         constexpr double projector_sigma_px = 0.02;  // the pixel is exact; its calibration is not
         if (lights) sights.push_back(sight(*lights, Eigen::Vector2d(x, y) + lit_off, projector_sigma_px));
         if (sights.size() < 2) continue;
-        auto found = meet(sights);
+        auto found = meet(sights, near);
         if (sights.size() > 2 && (!found || found->residual_px > options.most_residual_px)) {
           // One of them decoded wrongly: the pair with the last sight (the projector's, if any) that meets best.
           found.reset();
           for (size_t i = 0; i + 1 < sights.size(); ++i) {
             const std::array<Sight, 2> pair{sights[i], sights.back()};
-            const auto other = meet(pair);
+            const auto other = meet(pair, near);
             if (other && (!found || other->residual_px < found->residual_px)) found = other;
           }
         }
         if (!found || found->residual_px > options.most_residual_px || found->sigma_m > options.most_sigma_m) continue;
+        near = found->point;
         const size_t i = scan.index(x, y);
-        scan.points[i] = found->point.cast<float>();
+        scan.points[i] = near.cast<float>();
         scan.sigma_m[i] = static_cast<float>(found->sigma_m);
       }
+    }
   });
   if (work.stopped()) return Work::cancelled();
   return scan;
