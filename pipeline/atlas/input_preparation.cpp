@@ -53,12 +53,15 @@ std::vector<Eigen::Vector3f> project_vertices(const Mesh& mesh, const RigCamera&
 
 Image cropped_colours(const Image& pixels, const Box& box) {
   Image crop(box.right - box.left, box.bottom - box.top, 3);
-  for (int y = 0; y < crop.height; ++y)
-    for (int x = 0; x < crop.width; ++x) {
-      const uint8_t* from = pixels.pixel(box.left + x, box.top + y);
-      uint8_t* to = crop.pixel(x, y);
-      for (int c = 0; c < 3; ++c) to[c] = from[pixels.channels >= 3 ? c : 0];
-    }
+  for (int y = 0; y < crop.height; ++y) {
+    const uint8_t* from = pixels.pixel(box.left, box.top + y);
+    uint8_t* to = crop.pixel(0, y);
+    if (pixels.channels == 3)
+      std::copy_n(from, 3 * static_cast<ptrdiff_t>(crop.width), to);
+    else
+      for (int x = 0; x < crop.width; ++x, from += pixels.channels, to += 3)
+        for (int c = 0; c < 3; ++c) to[c] = from[pixels.channels > 3 ? c : 0];
+  }
   return crop;
 }
 
@@ -104,14 +107,17 @@ FloatImage depth_map(const Mesh& mesh, const std::vector<Eigen::Vector3f>& proje
     const int x1 = std::min(width - 1, static_cast<int>(std::floor(std::max({p[0].x(), p[1].x(), p[2].x()}))));
     const int y0 = std::max(0, static_cast<int>(std::ceil(std::min({p[0].y(), p[1].y(), p[2].y()}))));
     const int y1 = std::min(height - 1, static_cast<int>(std::floor(std::max({p[0].y(), p[1].y(), p[2].y()}))));
-    for (int y = y0; y <= y1; ++y)
+    const float share = 1 / twice_area;
+    for (int y = y0; y <= y1; ++y) {
+      float* row = inverse.pixel(0, y);
+      const float dy = static_cast<float>(y) - p[0].y();
       for (int x = x0; x <= x1; ++x) {
-        const float dx = static_cast<float>(x) - p[0].x(), dy = static_cast<float>(y) - p[0].y();
-        const float b = (dx * ac.y() - dy * ac.x()) / twice_area, c = (ab.x() * dy - ab.y() * dx) / twice_area;
-        if (b < 0 || c < 0 || b + c > 1) continue;
-        float& here = inverse.at(x, y);
-        here = std::max(here, p[0].z() + b * ab.z() + c * ac.z());
+        const float dx = static_cast<float>(x) - p[0].x();
+        const float b = (dx * ac.y() - dy * ac.x()) * share, c = (ab.x() * dy - ab.y() * dx) * share;
+        const float nearness = p[0].z() + b * ab.z() + c * ac.z();
+        row[x] = b >= 0 && c >= 0 && b + c <= 1 && nearness > row[x] ? nearness : row[x];
       }
+    }
   }
   for (float& sample : inverse.samples) sample = sample > 0 ? 1 / sample : no_surface;
   return inverse;
@@ -163,10 +169,11 @@ Image confidence_map(const Image& inside, const FloatImage& depth, double rim_px
     }
   const Raster<uint16_t> distance = chamfer_distance(doubtful);
   Image confidence(inside.width, inside.height, 1);
-  for (size_t i = 0; i < confidence.samples.size(); ++i) {
-    const double share = std::min(1.0, distance.samples[i] / (3 * rim_px));
-    confidence.samples[i] = static_cast<uint8_t>(std::lround(255 * share * share * (3 - 2 * share)));
-  }
+  std::vector<uint8_t> rising;  // by thirds of a pixel
+  for (double share = 0; share < 1; share = static_cast<double>(rising.size()) / (3 * rim_px))
+    rising.push_back(static_cast<uint8_t>(std::lround(255 * share * share * (3 - 2 * share))));
+  for (size_t i = 0; i < confidence.samples.size(); ++i)
+    confidence.samples[i] = distance.samples[i] < rising.size() ? rising[distance.samples[i]] : uint8_t{255};
   return confidence;
 }
 
@@ -184,21 +191,18 @@ void inpaint_rim(Image& colours, Image& valid) {
   grown.copyTo(known);
 }
 
-LightPyramid linear_light(const Pyramid& pyramid, const Eigen::Array3f& colour_gain) {
+LightImage linear_light(const Image& srgb, const Eigen::Array3f& colour_gain) {
   constexpr float brightest = 65535;
   std::array<std::array<uint16_t, 256>, 3> tables{};
   for (size_t c = 0; c < 3; ++c)
     for (size_t i = 0; i < tables[c].size(); ++i)
       tables[c][i] = static_cast<uint16_t>(std::lround(
           std::min(brightest, colour_gain[static_cast<Eigen::Index>(c)] * full_light * linear_light_of_srgb[i])));
-  LightPyramid light;
-  for (const Image& level : pyramid) {
-    LightImage& linear = light.emplace_back(level.width, level.height, 4);
-    const size_t pixels = level.samples.size() / 3;
-    for (size_t i = 0; i < pixels; ++i)
-      for (size_t c = 0; c < 3; ++c) linear.samples[4 * i + c] = tables[c][level.samples[3 * i + c]];
-  }
-  return light;
+  LightImage linear(srgb.width, srgb.height, 4);
+  const uint8_t* from = srgb.samples.data();
+  for (size_t i = 0; i < linear.samples.size(); i += 4, from += 3)
+    for (size_t c = 0; c < 3; ++c) linear.samples[i + c] = tables[c][from[c]];
+  return linear;
 }
 
 double median_depth(const FloatImage& depth) {
@@ -234,7 +238,7 @@ PreparedView prepare_view(const Mesh& mesh, const RigCamera& camera, const Frame
   for (int y = 0; y < valid.height; ++y)
     for (int x = 0; x < valid.width; ++x) valid.at(x, y) = inside.at(x / 2, y / 2);
   if (inpainting == Inpainting::telea) inpaint_rim(colours, valid);
-  view.colours = linear_light(push_pull(std::move(colours), valid), camera.colour_gain);
+  view.colours = push_pull(linear_light(colours, camera.colour_gain), valid);
   return view;
 }
 

@@ -19,12 +19,8 @@ enum class Inpainting {
   telea       ///< A. Telea, "An image inpainting technique based on the fast marching method", JGT 9(1), 2004
 };
 
-/// Linear light in 16 bits: red, green, blue and one that is not used, so that a pixel fills a register.
-using LightImage = Raster<uint16_t>;
-/// The brightest that a camera delivers; the other half of the range is room for gains.
+/// The brightest that a camera delivers, as a sample of a LightImage; the other half of the range is room for gains.
 constexpr float full_light = 32767;
-/// As Pyramid.
-using LightPyramid = std::vector<LightImage>;
 
 /// What texturing needs of one camera, cropped to the subject. Pixel coordinates are relative to the crop.
 struct PreparedView {

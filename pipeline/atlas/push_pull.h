@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdint>
 #include <vector>
 
 #include "pipeline/types/image.h"
@@ -10,12 +11,18 @@ namespace booth {
 /// lies at ((i + 0.5) · 2^k − 0.5, …) there.
 using Pyramid = std::vector<Image>;
 
+/// Linear light in 16 bits: red, green, blue and one that is not used, so that a pixel fills a register.
+using LightImage = Raster<uint16_t>;
+/// As Pyramid.
+using LightPyramid = std::vector<LightImage>;
+
 /// Fills the pixels that are not valid from those that are, smoothly and from ever farther away, and returns all
 /// levels on the way; averages are taken in linear light.
 ///
-/// @param image  3 channels
+/// @param image  sRGB of 3 channels, or light
 /// @param valid  1 channel, the same size, not 0 where a pixel holds a colour; if it is 0 everywhere, all is grey
 /// Source: S. J. Gortler et al., "The Lumigraph", SIGGRAPH 1996, section 4.2 (pull-push).
 Pyramid push_pull(Image image, const Image& valid);
+LightPyramid push_pull(LightImage image, const Image& valid);
 
 }  // namespace booth

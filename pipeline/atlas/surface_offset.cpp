@@ -231,20 +231,31 @@ std::vector<float> find_surface_offsets(const Mesh& mesh, std::span<const Prepar
   constexpr float roughness = 0.3F;      // by how much offsets differ for each pitch that vertices lie apart
   constexpr int sweeps = 8;
   std::vector<float> offset(scores.size(), 0.0F);
-  const auto price = [&](size_t v, float at) {
-    const float beyond = std::max(0.0F, std::abs(at) - limits[v] / pitch_m);
-    float sum = offset_price * at * at + outline_price * beyond * beyond;
+  // What it costs to differ from a neighbour, for each of neighbours.list.
+  std::vector<float> stiffness;
+  stiffness.reserve(neighbours.list.size());
+  for (size_t v = 0; v < scores.size(); ++v)
     for (const uint32_t n : neighbours.of(v)) {
-      const float apart = (mesh.positions[v] - mesh.positions[n]).norm() / pitch_m;
-      const float difference = (at - offset[n]) / (1 + roughness * apart);
-      sum += difference_price * difference * difference;
+      const float soft = 1 + roughness * (mesh.positions[v] - mesh.positions[n]).norm() / pitch_m;
+      stiffness.push_back(difference_price / (soft * soft));
     }
-    return sum;
-  };
   for (int sweep = 0; sweep < sweeps; ++sweep)
     for (size_t v = 0; v < scores.size(); ++v) {
+      // The neighbours' price of an offset x is total_stiffness x² − 2 pull x, but for what all offsets have in common.
+      float total_stiffness = offset_price, pull = 0;
+      const auto around = neighbours.of(v);
+      const float* stiff = stiffness.data() + neighbours.first[v];
+      for (size_t i = 0; i < around.size(); ++i) {
+        total_stiffness += stiff[i];
+        pull += stiff[i] * offset[around[i]];
+      }
+      const float limit = limits[v] / pitch_m;
       Scores total;
-      for (int k = 0; k < offsets; ++k) total[k] = summed[v][k] - price(v, static_cast<float>(k - steps));
+      for (int k = 0; k < offsets; ++k) {
+        const auto at = static_cast<float>(k - steps);
+        const float beyond = std::max(0.0F, std::abs(at) - limit);
+        total[k] = summed[v][k] - (total_stiffness * at - 2 * pull) * at - outline_price * beyond * beyond;
+      }
       Eigen::Index best = 0;
       total.maxCoeff(&best);
       offset[v] = static_cast<float>(best - steps);

@@ -67,8 +67,12 @@ struct FlatTriangle {
     return {static_cast<int>(std::ceil(from)), static_cast<int>(std::floor(to))};
   }
 
-  Eigen::Vector3f barycentric(int x, int y) const {
-    return barycentric_from_texel * Eigen::Vector3f(static_cast<float>(x), static_cast<float>(y), 1);
+  bool holds(int x, int y) const {
+    const auto u = static_cast<float>(x), v = static_cast<float>(y);
+    bool all = true;
+    for (Eigen::Index k = 0; k < 3; ++k)
+      all &= barycentric_from_texel(k, 0) * u + barycentric_from_texel(k, 1) * v + barycentric_from_texel(k, 2) >= 0;
+    return all;
   }
   /// To the nearest edge.
   float squared_distance(int x, int y) const {
@@ -113,7 +117,7 @@ class Stripe {
   void claim_inside(int32_t t, const FlatTriangle& triangle) {
     if (triangle.flat) return;
     for_each_texel(triangle, 0, [&](int x, int y, size_t i) {
-      if (owner_[i] != nobody || !(triangle.barycentric(x, y).minCoeff() >= 0)) return;
+      if (owner_[i] != nobody || !triangle.holds(x, y)) return;
       owner_[i] = t;
       distance2_[i] = 0;
       ++inside_;
@@ -158,29 +162,23 @@ class Stripe {
   size_t inside_ = 0;
 };
 
-/// Continued far beyond a thin triangle, a point would lie anywhere: keep to its surroundings.
-Eigen::Vector3f near_triangle(Eigen::Vector3f barycentric) {
-  constexpr float beyond = 0.5F;
-  barycentric = barycentric.cwiseMax(-beyond).cwiseMin(1 + beyond);
-  return barycentric / barycentric.sum();
-}
-
 /// Collects a triangle's texels, has them painted and writes them.
 class BatchWriter {
  public:
-  BatchWriter(const TrianglePainter& paint, TexelColours* result) : paint_(paint), result_(result) {}
+  BatchWriter(const FlatTriangle& triangle, const TrianglePainter& paint, TexelColours* result)
+      : triangle_(triangle), paint_(paint), result_(result) {}
 
-  void add(int x, int y, const Eigen::Vector3f& corner_weights) {
-    for (size_t k = 0; k < 3; ++k)
-      batch_.corner_weights[k][batch_.count] = corner_weights[static_cast<Eigen::Index>(k)];
-    texels_[batch_.count] = {x, y};
+  void add(int x, int y) {
+    x_[batch_.count] = static_cast<float>(x);
+    y_[batch_.count] = static_cast<float>(y);
     if (++batch_.count == TexelBatch::capacity) flush();
   }
   void flush() {
     if (batch_.count == 0) return;
+    find_corner_weights();
     paint_(batch_);
     for (size_t i = 0; i < batch_.count; ++i) {
-      const auto [x, y] = texels_[i];
+      const int x = static_cast<int>(x_[i]), y = static_cast<int>(y_[i]);
       uint8_t* out = result_->image.pixel(x, y);
       for (Eigen::Index c = 0; c < 3; ++c) out[c] = srgb_from_linear(batch_.light[i][c]);
       result_->painted.at(x, y) = 255;
@@ -189,10 +187,32 @@ class BatchWriter {
   }
 
  private:
+  void find_corner_weights() {
+    // Continued far beyond a thin triangle, a point would lie anywhere: keep to its surroundings.
+    constexpr float beyond = 0.5F;
+    const Eigen::Matrix3f& from_texel = triangle_.barycentric_from_texel;
+    auto& [a, b, c] = batch_.corner_weights;
+    for (Eigen::Index k = 0; k < 3; ++k) {
+      auto& weights = batch_.corner_weights[static_cast<size_t>(k)];
+      const float by_x = from_texel(k, 0), by_y = from_texel(k, 1), at_zero = from_texel(k, 2);
+      for (size_t i = 0; i < batch_.count; ++i) {
+        const float weight = by_x * x_[i] + by_y * y_[i] + at_zero;
+        weights[i] = std::min(std::max(weight, -beyond), 1 + beyond);
+      }
+    }
+    for (size_t i = 0; i < batch_.count; ++i) {
+      const float scale = 1 / (a[i] + b[i] + c[i]);
+      a[i] *= scale;
+      b[i] *= scale;
+      c[i] *= scale;
+    }
+  }
+
+  const FlatTriangle& triangle_;
   const TrianglePainter& paint_;
   TexelColours* result_;
   TexelBatch batch_;
-  std::array<std::pair<int, int>, TexelBatch::capacity> texels_;
+  TexelBatch::Each<float> x_, y_;
 };
 
 }  // namespace
@@ -221,9 +241,8 @@ TexelColours paint_texels(const Packing& packing, int size, const std::function<
       for (size_t i = 0; i < flat.size(); ++i) stripe.claim_band(triangles_of[s][i], flat[i]);
       for (size_t i = 0; i < flat.size(); ++i) {
         const TrianglePainter paint = painter_of(static_cast<size_t>(triangles_of[s][i]));
-        BatchWriter writer(paint, &result);
-        stripe.for_each_owned(triangles_of[s][i], flat[i],
-                              [&](int x, int y) { writer.add(x, y, near_triangle(flat[i].barycentric(x, y))); });
+        BatchWriter writer(flat[i], paint, &result);
+        stripe.for_each_owned(triangles_of[s][i], flat[i], [&](int x, int y) { writer.add(x, y); });
         writer.flush();
       }
       inside[s] = stripe.inside();

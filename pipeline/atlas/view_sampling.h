@@ -103,18 +103,19 @@ inline Trust look_up(const PreparedView& view, float x, float y, float depth_m) 
   const float v = std::clamp(0.5F * y - 0.25F, 0.0F, static_cast<float>(view.depth.height - 1));
   const int u0 = std::min(static_cast<int>(u), std::max(0, view.depth.width - 2));
   const int v0 = std::min(static_cast<int>(v), std::max(0, view.depth.height - 2));
-  const int u1 = std::min(u0 + 1, view.depth.width - 1), v1 = std::min(v0 + 1, view.depth.height - 1);
-  const float surface_m = std::max(std::max(view.depth.at(u0, v0), view.depth.at(u1, v0)),
-                                   std::max(view.depth.at(u0, v1), view.depth.at(u1, v1)));
+  const ptrdiff_t right = view.depth.width > 1 ? 1 : 0, down = view.depth.height > 1 ? view.depth.width : 0;
+  const float* depth = view.depth.pixel(u0, v0);
+  const float surface_m = std::max(std::max(depth[0], depth[right]), std::max(depth[down], depth[down + right]));
   // Fully visible up to half the bias behind the depth map, hidden from one and a half of it.
   constexpr float bias_m = 0.012F;
   const float visible = std::clamp(1.5F - (depth_m - surface_m) / bias_m, 0.0F, 1.0F);
   if (visible <= 0) return {};
   const float fu = u - static_cast<float>(u0), fv = v - static_cast<float>(v0);
-  const auto confidence = [&](int i, int j) { return static_cast<float>(view.confidence.at(i, j)); };
-  const float sure = (1 - fv) * ((1 - fu) * confidence(u0, v0) + fu * confidence(u1, v0)) +
-                     fv * ((1 - fu) * confidence(u0, v1) + fu * confidence(u1, v1));
-  return {visible, sure / 255};
+  const uint8_t* sure = view.confidence.pixel(u0, v0);
+  const auto between = [fu](uint8_t here, uint8_t beside) {
+    return (1 - fu) * static_cast<float>(here) + fu * static_cast<float>(beside);
+  };
+  return {visible, ((1 - fv) * between(sure[0], sure[right]) + fv * between(sure[down], sure[down + right])) / 255};
 }
 
 }  // namespace booth
