@@ -109,14 +109,13 @@ std::vector<Eigen::Array3f> balance_colours(const Mesh& mesh, std::span<const Pr
 }
 
 void apply_gains(std::span<PreparedView> views, std::span<const Eigen::Array3f> gains, const Work& work) {
-  constexpr float brightest = 65535;
   work.parallel_for(views.size(), 1, [&](size_t begin, size_t end) {
     for (size_t c = begin; c < end; ++c)
       for (LightImage& level : views[c].colours)
         for (size_t i = 0; i < level.samples.size(); i += 4)
           for (size_t k = 0; k < 3; ++k) {
             const float light = gains[c][static_cast<Eigen::Index>(k)] * static_cast<float>(level.samples[i + k]);
-            level.samples[i + k] = static_cast<uint16_t>(std::min(light + 0.5F, brightest));
+            level.samples[i + k] = static_cast<int16_t>(std::min(light + 0.5F, brightest_light));
           }
   });
 }

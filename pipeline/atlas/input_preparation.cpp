@@ -192,12 +192,11 @@ void inpaint_rim(Image& colours, Image& valid) {
 }
 
 LightImage linear_light(const Image& srgb, const Eigen::Array3f& colour_gain) {
-  constexpr float brightest = 65535;
-  std::array<std::array<uint16_t, 256>, 3> tables{};
+  std::array<std::array<int16_t, 256>, 3> tables{};
   for (size_t c = 0; c < 3; ++c)
     for (size_t i = 0; i < tables[c].size(); ++i)
-      tables[c][i] = static_cast<uint16_t>(std::lround(
-          std::min(brightest, colour_gain[static_cast<Eigen::Index>(c)] * full_light * linear_light_of_srgb[i])));
+      tables[c][i] = static_cast<int16_t>(std::lround(
+          std::min(brightest_light, colour_gain[static_cast<Eigen::Index>(c)] * full_light * linear_light_of_srgb[i])));
   LightImage linear(srgb.width, srgb.height, 4);
   const uint8_t* from = srgb.samples.data();
   for (size_t i = 0; i < linear.samples.size(); i += 4, from += 3)

@@ -20,7 +20,7 @@ enum class Inpainting {
 };
 
 /// The brightest that a camera delivers, as a sample of a LightImage; the other half of the range is room for gains.
-constexpr float full_light = 32767;
+constexpr float full_light = 16383, brightest_light = 32767;
 
 /// What texturing needs of one camera, cropped to the subject. Pixel coordinates are relative to the crop.
 struct PreparedView {

@@ -38,21 +38,21 @@ class SrgbMean {
 
 class LightMean {
  public:
-  using Sample = uint16_t;
-  static constexpr Sample grey = 7000;  // about as above
+  using Sample = int16_t;
+  static constexpr Sample grey = 3500;  // about as above
 
   void add(const Sample* pixel) {
     for (size_t c = 0; c < sum_.size(); ++c) sum_[c] += pixel[c];
   }
   void write(int count, Sample* pixel) const {
-    constexpr uint32_t divisible = 12;  // by one, two, three and four
-    const uint32_t factor = divisible / static_cast<uint32_t>(count);
+    constexpr int32_t divisible = 12;  // by one, two, three and four
+    const int32_t factor = divisible / count;
     for (size_t c = 0; c < sum_.size(); ++c)
       pixel[c] = static_cast<Sample>((sum_[c] * factor + divisible / 2) / divisible);
   }
 
  private:
-  std::array<uint32_t, 4> sum_{};
+  std::array<int32_t, 4> sum_{};
 };
 
 /// Each pixel the mean of its valid children, valid if any of them is.

@@ -11,8 +11,8 @@ namespace booth {
 /// lies at ((i + 0.5) · 2^k − 0.5, …) there.
 using Pyramid = std::vector<Image>;
 
-/// Linear light in 16 bits: red, green, blue and one that is not used, so that a pixel fills a register.
-using LightImage = Raster<uint16_t>;
+/// Linear light, 0 … 32767: red, green, blue and one that is not used, so that a pixel fills a register.
+using LightImage = Raster<int16_t>;
 /// As Pyramid.
 using LightPyramid = std::vector<LightImage>;
 

@@ -31,7 +31,7 @@ constexpr size_t most_cameras = 4;
 FloatImage grey_image(const LightImage& light) {
   FloatImage grey(light.width, light.height, 1);
   for (size_t i = 0; i < grey.samples.size(); ++i) {
-    const uint16_t* p = light.samples.data() + 4 * i;
+    const int16_t* p = light.samples.data() + 4 * i;
     const float luma =
         0.25F * static_cast<float>(p[0]) + 0.5F * static_cast<float>(p[1]) + 0.25F * static_cast<float>(p[2]);
     grey.samples[i] = 255 * std::sqrt(luma / full_light);

@@ -2,11 +2,15 @@
 
 #include <Eigen/Core>
 #include <algorithm>
+#include <array>
 #include <bit>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#ifdef __SSE2__
+#include <emmintrin.h>
+#endif
 
 #include "pipeline/atlas/input_preparation.h"
 
@@ -19,8 +23,8 @@ namespace sampling {
 using Floats = float __attribute__((vector_size(16)));
 
 /// A pixel's red, green, blue and padding.
-inline Floats pixel_at(const uint16_t* p) {
-  using Words = uint16_t __attribute__((vector_size(8)));
+inline Floats pixel_at(const int16_t* p) {
+  using Words = int16_t __attribute__((vector_size(8)));
   using Integers = int32_t __attribute__((vector_size(16)));
   Words words;
   std::memcpy(&words, p, sizeof words);
@@ -28,11 +32,49 @@ inline Floats pixel_at(const uint16_t* p) {
       std::bit_cast<Integers>(__builtin_shufflevector(words, Words{}, 0, 4, 1, 5, 2, 6, 3, 7)), Floats);
 }
 
-/// Of the four pixels around a place that is `f` behind the second.
-inline Floats cubic_weights(float f) {
-  constexpr Floats constant{0, 1, 0, 0}, linear{-0.5F, 0, 0.5F, 0}, square{1, -2.5F, 2, -0.5F},
-      cube{-0.5F, 1.5F, -1.5F, 0.5F};
-  return constant + f * (linear + f * (square + f * cube));
+/// Weights of the four pixels around a place that is `f` behind the second, in whole numbers.
+/// Source: R. Keys, "Cubic convolution interpolation for digital image processing", IEEE ASSP 29(6), 1981.
+struct CubicWeights {
+  static constexpr int one = 1 << 14;
+  std::array<int16_t, 4> of{};
+
+  constexpr CubicWeights() = default;
+  constexpr explicit CubicWeights(double f) {
+    const auto whole = [](double weight) { return static_cast<int16_t>(one * weight + (weight < 0 ? -0.5 : 0.5)); };
+    const double f2 = f * f, f3 = f2 * f;
+    of = {whole(f2 - 0.5 * (f + f3)), 0, whole(0.5 * f + 2 * f2 - 1.5 * f3), whole(0.5 * (f3 - f2))};
+    of[1] = static_cast<int16_t>(one - of[0] - of[2] - of[3]);  // so that they sum to one exactly
+  }
+};
+
+/// A place is told to a thousandth of a pixel, about.
+constexpr int cubic_steps = 512;
+inline constexpr auto cubic_weights = [] {
+  std::array<CubicWeights, cubic_steps + 1> table;
+  for (int i = 0; i <= cubic_steps; ++i)
+    table[static_cast<size_t>(i)] = CubicWeights(static_cast<double>(i) / cubic_steps);
+  return table;
+}();
+
+/// The weighted sum of four pixels side by side, times CubicWeights::one.
+inline Floats weighted_row(const int16_t* pixels, const CubicWeights& weights) {
+#ifdef __SSE2__
+  const auto pair = [&](const int16_t* two, int16_t one, int16_t other) {
+    const __m128i both = _mm_loadu_si128(reinterpret_cast<const __m128i*>(two));
+    const __m128i factors = _mm_set1_epi32(static_cast<uint16_t>(one) | static_cast<int32_t>(other) * (1 << 16));
+    return _mm_madd_epi16(_mm_unpacklo_epi16(both, _mm_unpackhi_epi64(both, both)), factors);
+  };
+  return _mm_cvtepi32_ps(
+      _mm_add_epi32(pair(pixels, weights.of[0], weights.of[1]), pair(pixels + 8, weights.of[2], weights.of[3])));
+#else
+  Floats sum{};
+  for (size_t c = 0; c < 4; ++c) {
+    int32_t whole = 0;
+    for (size_t i = 0; i < 4; ++i) whole += weights.of[i] * pixels[4 * i + c];
+    sum[c] = static_cast<float>(whole);
+  }
+  return sum;
+#endif
 }
 
 /// Light of sample_level() in the camera's units.
@@ -44,8 +86,8 @@ inline Floats bilinear(const LightPyramid& pyramid, size_t level, float x, float
   const int u0 = std::min(static_cast<int>(u), std::max(0, image.width - 2));
   const int v0 = std::min(static_cast<int>(v), std::max(0, image.height - 2));
   const float fu = u - static_cast<float>(u0), fv = v - static_cast<float>(v0);
-  const uint16_t* a = image.pixel(u0, v0);
-  const uint16_t* b = image.width > 1 ? a + 4 : a;
+  const int16_t* a = image.pixel(u0, v0);
+  const int16_t* b = image.width > 1 ? a + 4 : a;
   const ptrdiff_t down = image.height > 1 ? 4 * static_cast<ptrdiff_t>(image.width) : 0;
   return (1 - fv) * ((1 - fu) * pixel_at(a) + fu * pixel_at(b)) +
          fv * ((1 - fu) * pixel_at(a + down) + fu * pixel_at(b + down));
@@ -53,19 +95,21 @@ inline Floats bilinear(const LightPyramid& pyramid, size_t level, float x, float
 
 /// Light of sample_pyramid() on level 0 in the camera's units, by cubic convolution, which keeps the detail that
 /// bilinear interpolation blurs. Next to the image's border it is bilinear.
-/// Source: R. Keys, "Cubic convolution interpolation for digital image processing", IEEE ASSP 29(6), 1981.
 inline Floats cubic(const LightPyramid& pyramid, float x, float y) {
   const LightImage& image = pyramid.front();
   if (!(x >= 1 && y >= 1 && x < static_cast<float>(image.width - 2) && y < static_cast<float>(image.height - 2)))
     return bilinear(pyramid, 0, x, y);
   const int u0 = static_cast<int>(x), v0 = static_cast<int>(y);
-  const Floats across = cubic_weights(x - static_cast<float>(u0)), along = cubic_weights(y - static_cast<float>(v0));
-  const uint16_t* row = image.pixel(u0 - 1, v0 - 1);
+  const auto weights = [](float f) -> const CubicWeights& {
+    return cubic_weights[static_cast<size_t>(static_cast<int>(f * cubic_steps + 0.5F))];
+  };
+  const CubicWeights &across = weights(x - static_cast<float>(u0)), &along = weights(y - static_cast<float>(v0));
+  const int16_t* row = image.pixel(u0 - 1, v0 - 1);
   const ptrdiff_t down = 4 * static_cast<ptrdiff_t>(image.width);
   Floats light{};
-  for (size_t j = 0; j < 4; ++j, row += down)
-    light += along[j] * (across[0] * pixel_at(row) + across[1] * pixel_at(row + 4) + across[2] * pixel_at(row + 8) +
-                         across[3] * pixel_at(row + 12));
+  for (size_t j = 0; j < 4; ++j, row += down) light += static_cast<float>(along.of[j]) * weighted_row(row, across);
+  constexpr float scale = 1.0F / CubicWeights::one / CubicWeights::one;
+  light *= scale;
   return light > 0 ? light : Floats{};
 }
 
