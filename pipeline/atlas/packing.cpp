@@ -29,8 +29,23 @@ struct Run {
 };
 struct Footprint {
   int width = 0, height = 0;  ///< blocks
-  std::vector<Run> runs;      ///< longest first: the least likely to fit is tried first
+  std::vector<Run> runs;      ///< of spread_out()
 };
+
+/// Puts first the longest run, then such as lie far from all before: neighbouring rows fail at the same places, so a
+/// place where the piece does not fit is soon found out.
+void spread_out(Footprint* footprint) {
+  std::vector<Run>& runs = footprint->runs;
+  if (runs.empty()) return;
+  const auto order = [](const Run& run) {  // rows by their reversed bits: 0, 1/2, 1/4, 3/4, 1/8 …
+    uint32_t row = static_cast<uint32_t>(run.row), reversed = 0;
+    for (int bit = 0; bit < 16; ++bit, row >>= 1) reversed = reversed << 1 | (row & 1);
+    return reversed;
+  };
+  std::stable_sort(runs.begin(), runs.end(), [&](const Run& l, const Run& r) { return order(l) < order(r); });
+  std::iter_swap(runs.begin(), std::max_element(runs.begin(), runs.end(),
+                                                [](const Run& l, const Run& r) { return l.length() < r.length(); }));
+}
 
 /// A chart with y downwards, turned so that its bounding box is the smallest, its lowest corner at the origin;
 /// metres × density.
@@ -118,14 +133,21 @@ Footprint footprint_of(const Piece& piece, double texels_per_m, int gutter_texel
               x1 = std::min(footprint.width, static_cast<int>(high.x()) + 1);
     const int y0 = std::max(0, static_cast<int>(low.y())),
               y1 = std::min(footprint.height, static_cast<int>(high.y()) + 1);
-    for (int y = y0; y < y1; ++y)
-      for (int x = x0; x < x1; ++x) {
-        const double cx = x + 0.5, cy = y + 0.5;
-        bool touches = true;
-        for (const Eigen::Vector3d& e : edges) touches = touches && e.x() * cx + e.y() * cy <= e.z();
-        if (touches)
-          covered[static_cast<size_t>(y) * static_cast<size_t>(footprint.width) + static_cast<size_t>(x)] = 1;
+    for (int y = y0; y < y1; ++y) {
+      double from = x0, to = x1 - 1;
+      for (const Eigen::Vector3d& e : edges) {
+        const double left = e.z() - e.y() * (y + 0.5);  // of what e.x() (x + 0.5) may be
+        if (e.x() > 0)
+          to = std::min(to, left / e.x() - 0.5);
+        else if (e.x() < 0)
+          from = std::max(from, left / e.x() - 0.5);
+        else if (left < 0)
+          to = -1;
       }
+      const int first = static_cast<int>(std::ceil(from)), last = static_cast<int>(std::floor(to));
+      if (first > last) continue;
+      std::fill_n(covered.begin() + static_cast<ptrdiff_t>(y) * footprint.width + first, last - first + 1, uint8_t{1});
+    }
   }
   for (int y = 0; y < footprint.height; ++y) {
     const uint8_t* row = covered.data() + static_cast<size_t>(y) * static_cast<size_t>(footprint.width);
@@ -136,8 +158,7 @@ Footprint footprint_of(const Piece& piece, double texels_per_m, int gutter_texel
       footprint.runs.push_back({y, begin, x});
     }
   }
-  std::stable_sort(footprint.runs.begin(), footprint.runs.end(),
-                   [](const Run& l, const Run& r) { return l.length() > r.length(); });
+  spread_out(&footprint);
   return footprint;
 }
 
@@ -159,8 +180,14 @@ Footprint quarter_turned(const Footprint& footprint) {
       while (x < turned.width && row[static_cast<size_t>(x)] != 0) ++x;
       turned.runs.push_back({y, begin, x});
     }
-  std::stable_sort(turned.runs.begin(), turned.runs.end(),
-                   [](const Run& l, const Run& r) { return l.length() > r.length(); });
+  spread_out(&turned);
+  return turned;
+}
+
+Footprint half_turned(const Footprint& footprint) {
+  Footprint turned = footprint;
+  for (Run& run : turned.runs)
+    run = {footprint.height - 1 - run.row, footprint.width - run.end, footprint.width - run.begin};
   return turned;
 }
 
@@ -186,7 +213,6 @@ class Bin {
     const int last = std::min(height_, best_top) - footprint.height;
     std::vector<uint64_t> open(words_);
     for (int y = first; y <= last; ++y) {
-      if (!rows_have_room(footprint, y)) continue;
       set_first(open, width_ - footprint.width + 1);
       bool any = true;
       for (const Run& run : footprint.runs)
@@ -216,12 +242,6 @@ class Bin {
     return bits_.data() + (static_cast<size_t>(y) * levels_ + k) * words_;
   }
 
-  bool rows_have_room(const Footprint& footprint, int y) const {
-    for (const Run& run : footprint.runs)
-      if (longest_free_[static_cast<size_t>(y + run.row)] < run.length()) return false;
-    return true;
-  }
-
   static void set_first(std::vector<uint64_t>& open, int count) {
     for (size_t w = 0; w < open.size(); ++w) {
       const int here = std::clamp(count - static_cast<int>(64 * w), 0, 64);
@@ -231,6 +251,7 @@ class Bin {
 
   /// Removes the places where the run would meet what is taken; false when none is left.
   bool close(std::vector<uint64_t>& open, const Run& run, int y) const {
+    if (longest_free_[static_cast<size_t>(y + run.row)] < run.length()) return false;
     const auto k = static_cast<size_t>(std::bit_width(static_cast<unsigned>(run.length())) - 1);
     const uint64_t* smeared = level(y + run.row, k);
     const int first = run.begin, second = run.end - (1 << k);
@@ -317,7 +338,8 @@ std::optional<std::vector<Placed>> place_all(const std::vector<Piece>& pieces, d
   const auto prepared = [&](const Piece& piece) {
     Waiting waiting{&piece, {}};
     waiting.turns[0] = footprint_of(piece, texels_per_m, gutter_texels);
-    for (size_t turn = 1; turn < 4; ++turn) waiting.turns[turn] = quarter_turned(waiting.turns[turn - 1]);
+    waiting.turns[1] = quarter_turned(waiting.turns[0]);
+    for (size_t turn = 2; turn < 4; ++turn) waiting.turns[turn] = half_turned(waiting.turns[turn - 2]);
     return waiting;
   };
   std::vector<Waiting> waiting(pieces.size());
@@ -337,7 +359,7 @@ std::optional<std::vector<Placed>> place_all(const std::vector<Piece>& pieces, d
   std::priority_queue<std::tuple<double, int64_t>> queue;
   for (size_t i = 0; i < waiting.size(); ++i) queue.emplace(pieces[i].extent.prod(), -static_cast<int64_t>(i));
 
-  const size_t most_pieces = 2 * pieces.size() + 16;
+  const size_t most_pieces = 3 * pieces.size() + 64;
   Bin bin(side, side);
   std::vector<Placed> done;
   while (!queue.empty()) {

@@ -5,9 +5,12 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <set>
 #include <vector>
 
 #include "pipeline/atlas/charting.h"
+#include "pipeline/atlas/planar_grid.h"
 #include "pipeline/atlas/push_pull.h"
 #include "pipeline/surface/marching_cubes.h"
 #include "pipeline/thread_pool.h"
@@ -87,6 +90,53 @@ TEST(Packing, ChartsKeepTheirGutterInsideTheAtlas) {
       }
     EXPECT_GT(static_cast<double>(used) / (size * size), charting == Charting::flattening ? 0.5 : 0.2);
   }
+}
+
+/// Pairs of triangles of the atlas that overlap by more than rounding does, by the separating axes of their edges.
+size_t overlapping_pairs(const Packing& packing) {
+  constexpr double rounding_texels = 1e-6, cell_texels = 8;
+  const size_t triangles = packing.corners.size();
+  PlanarGrid grid(cell_texels);
+  std::vector<FlatCorners> upright;  // counter-clockwise with y upwards
+  for (const auto& corners : packing.corners) {
+    FlatCorners& flipped = upright.emplace_back(corners);
+    for (Eigen::Vector2d& p : flipped) p.y() = -p.y();
+  }
+  size_t pairs = 0;
+  for (size_t t = 0; t < triangles; ++t) {
+    std::set<int32_t> overlapping;  // the grid may name one repeatedly
+    grid.all_near(upright[t], 0, [&](int32_t other) {
+      const FlatCorners& there = upright[static_cast<size_t>(other)];
+      if (std::max(separation(upright[t], there), separation(there, upright[t])) < -rounding_texels)
+        overlapping.insert(other);
+      return true;
+    });
+    pairs += overlapping.size();
+    grid.add(static_cast<int32_t>(t), upright[t]);
+  }
+  return pairs;
+}
+
+TEST(Packing, NoTwoTrianglesOverlap) {
+  for (const Charting charting : {Charting::unfolding, Charting::flattening}) {
+    Packing packing = packed_person(charting, 2).packing;
+    ASSERT_GT(packing.texels_per_m, 0);
+    EXPECT_EQ(overlapping_pairs(packing), 0U);
+    const Eigen::Vector2d onto_another = packing.corners.back()[0] - packing.corners[0][0];
+    for (Eigen::Vector2d& p : packing.corners[0]) p += onto_another;
+    EXPECT_GT(overlapping_pairs(packing), 0U) << "the check is blind";
+  }
+}
+
+TEST(Packing, FillsThreeQuartersOfAnAtlas) {
+  constexpr int large = 2048, gutter = 4;
+  const Mesh mesh = extract_surface(synthetic::sample_field(synthetic::person().body, 0.02));
+  const std::vector<Chart> charts = cut_into_charts(mesh, Charting::flattening, 0.002);
+  const Packing packing =
+      pack_charts(charts, mesh.triangles.size(), std::vector<double>(charts.size(), 1.0), large, gutter);
+  double twice_used = 0;
+  for (const auto& corners : packing.corners) twice_used += std::abs(twice_area(corners));
+  EXPECT_GE(0.5 * twice_used / (large * large), 0.75);
 }
 
 TEST(Packing, ChartsAreScaledAlikeAndNeverMirrored) {
