@@ -13,6 +13,7 @@
 #include <system_error>
 #include <utility>
 
+#include "config/migration.h"
 #include "replay/durable_folder.h"
 
 namespace booth {
@@ -26,6 +27,7 @@ using Words = std::vector<std::pair<std::string_view, Value>>;
 /// "NAME=VALUE" texts.
 using Assignments = std::vector<std::pair<std::string, std::string>>;
 
+constexpr const char* version_key = "version";
 constexpr size_t longest_name = 64;
 constexpr size_t longest_path = 4000;
 
@@ -922,9 +924,16 @@ std::string ConfigFault::to_string() const {
 
 ConfigReading parse_config(std::string_view text, const fs::path& folder) {
   ConfigReading reading;
+  const auto migrated = migrate_config(text);
+  if (!migrated) {
+    reading.faults.push_back({version_key, migrated.error().message, ""});
+    return reading;
+  }
   try {
-    const toml::table table = toml::parse(text);
+    const toml::table table = *migrated ? toml::parse((*migrated)->text) : toml::parse(text);
     Reader reader(table, "", folder, reading.faults);
+    int version = config_version;
+    reader.integer(version_key, version, config_version, config_version);
     visit_config(reader, reading.config);
     reader.refuse_unknown();
   } catch (const toml::parse_error& error) {
@@ -955,6 +964,7 @@ Result<BoothConfig> load_config(const fs::path& file) {
 std::string write_config(const BoothConfig& config) {
   Writer writer;
   BoothConfig copy = config;
+  writer.integer(version_key, config_version, config_version, config_version);
   visit_config(writer, copy);
   return writer.text();
 }
@@ -962,6 +972,7 @@ std::string write_config(const BoothConfig& config) {
 std::vector<std::string> config_keys() {
   Lister lister;
   BoothConfig config;
+  lister.integer(version_key, config_version, config_version, config_version);
   visit_config(lister, config);
   return std::move(lister.keys);
 }

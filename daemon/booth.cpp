@@ -37,7 +37,8 @@ constexpr std::chrono::milliseconds disk_pause{2000};  ///< between two looks at
 constexpr std::chrono::hours sweep_pause{1};           ///< between two looks for what could not be removed at once
 /// What a process of the last run was still dying in could not be removed at the start.
 constexpr std::chrono::seconds first_sweep{10};
-constexpr std::chrono::minutes relearning_pause{5};          ///< between two tries to learn the background unasked
+constexpr std::chrono::minutes relearning_pause{5};  ///< between two tries to learn the background unasked
+constexpr size_t most_interrupted = 100;             ///< captures that ended with the daemon: the newest are kept
 constexpr std::chrono::milliseconds drain_patience{10'000};  ///< for a capture under way
 
 ErrorCode code_of(const std::string& kind) {
@@ -78,6 +79,7 @@ Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<D
     spdlog::error("no devices: {}", booth->device_fault_);
   }
   booth->adopt_orphans();
+  booth->name_interrupted();
 
   const BoothConfig& config = options.config;
   booth->runner_ = std::make_unique<JobRunner>(
@@ -94,7 +96,7 @@ Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<D
         self->health_.report(capture, cameras);
       });
   booth->eraser_ = std::make_unique<Eraser>(config.booth.state_directory, *booth->jobs_, *booth->avatars_,
-                                            booth->session_.get(), booth->events_);
+                                            *booth->journal_, booth->session_.get(), booth->events_);
   booth->set_state(booth->device_fault_.empty() ? BoothState::idle : BoothState::fault);
   booth->housekeeper_ = std::jthread([self = booth.get()](const std::stop_token& stop) { self->keep_house(stop); });
   pthread_setname_np(booth->housekeeper_.native_handle(), "house");
@@ -146,6 +148,9 @@ Result<void> Booth::open_stores() {
   auto avatars = AvatarStore::open(booth.avatars());
   if (!avatars) return avatars.error();
   avatars_ = std::move(*avatars);
+  auto journal = CaptureJournal::open(booth.captures_under_way());
+  if (!journal) return journal.error();
+  journal_ = std::make_unique<CaptureJournal>(std::move(*journal));
   auto backgrounds = BackgroundStore::open(booth.backgrounds());
   if (!backgrounds) return backgrounds.error();
   backgrounds_ = std::move(*backgrounds);
@@ -230,6 +235,7 @@ void Booth::open_capture(const Devices& devices) {
                    .tasks = tasks_,
                    .backgrounds = *backgrounds_,
                    .calibration = *calibration_desk_,
+                   .journal = *journal_,
                    .devices = [this] { return this->devices(); },
                    .jobs = *jobs_,
                    .events = events_,
@@ -283,7 +289,7 @@ void Booth::adopt_orphans() {
     jobs_->release(id);
   }
   for (const Job& job : jobs_->list()) {
-    if (avatars_->find(job.id)) continue;
+    if (!job.recorded || avatars_->find(job.id)) continue;
     if (fs::exists(booth.recordings() / job.id, code)) {
       jobs_->redo(job.id);
       continue;
@@ -291,6 +297,43 @@ void Booth::adopt_orphans() {
     spdlog::info("job {}: its recording is gone, and so it goes", job.id);
     jobs_->forget(job.id);
     if (const auto written = jobs_->persist(job.id); !written) spdlog::error("{}", written.error().message);
+  }
+}
+
+/// Captures that somebody was told to have begun, and that ended with the last process before they were recorded, are
+/// failed jobs from now on: the queue, the list of jobs and an event say so, until they are deleted.
+void Booth::name_interrupted() {
+  const auto unfinished = journal_->unfinished();
+  if (!unfinished) return spdlog::error("{}", unfinished.error().message);
+  const IdentityConfig& booth = options_.config.booth;
+  std::error_code code;
+  for (const std::string& id : *unfinished) {
+    if (!jobs_->find(id)) {
+      if (fs::exists(booth.recordings() / id, code)) continue;  // one that the disk does not give now, but may yet
+      const Error error{ErrorCode::internal, "the booth was stopped while capturing"};
+      spdlog::warn("capture {}: failed: {}", id, error.message);
+      metrics_.add("captures_failed");
+      jobs_->add({.id = id,
+                  .face = "auto",
+                  .state = JobState::failed,
+                  .error = Reason{std::string(to_string(error.code)), error.message},
+                  .recorded = false});
+      events_.publish(CaptureFailed{id, error});
+      const auto written = jobs_->persist(id);
+      jobs_->release(id);
+      if (!written) {
+        spdlog::error("{}", written.error().message);
+        continue;
+      }
+    }
+    if (const auto ended = journal_->end(id); !ended) spdlog::warn("{}", ended.error().message);
+  }
+  std::vector<std::string> unrecorded;
+  for (const Job& job : jobs_->list())
+    if (!job.recorded) unrecorded.push_back(job.id);
+  for (size_t i = 0; i + most_interrupted < unrecorded.size(); ++i) {
+    jobs_->forget(unrecorded[i]);
+    if (const auto written = jobs_->persist(unrecorded[i]); !written) spdlog::warn("{}", written.error().message);
   }
 }
 
@@ -636,7 +679,7 @@ std::map<std::string, double> Booth::measurements() const {
   return values;
 }
 
-Result<std::string> Booth::start_capture(const CaptureRequest& request) {
+Result<std::string> Booth::start_capture(const CaptureRequest& request, CaptureSession::Acknowledge acknowledge) {
   if (session_ != nullptr && session_->current() == std::nullopt && request.face == FaceMode::active &&
       !session_->projector())
     return Error{ErrorCode::unsupported, "this booth has no projector: choose the face mode passive or none"};
@@ -645,7 +688,7 @@ Result<std::string> Booth::start_capture(const CaptureRequest& request) {
     return Error{ErrorCode::not_calibrated, "the projector is not calibrated: choose the face mode passive or none"};
   if (request.face == FaceMode::active && session_->projector()->state == DeviceState::offline)
     return Error{ErrorCode::device_lost, "the projector is offline: " + session_->projector()->message};
-  return session_->start(request);
+  return session_->start(request, std::move(acknowledge));
 }
 
 Result<void> Booth::cancel_capture(const std::string& capture) {

@@ -17,6 +17,7 @@
 #include "daemon/background_store.h"
 #include "daemon/calibration_desk.h"
 #include "daemon/camera_supervisor.h"
+#include "daemon/capture_journal.h"
 #include "daemon/capture_session.h"
 #include "daemon/disk_guard.h"
 #include "daemon/eraser.h"
@@ -156,7 +157,8 @@ class Booth {
   std::shared_ptr<const Rig> rig() const;
 
   /// @error busy, unsupported, not_ready, not_calibrated, no_background, disk_full, device_lost
-  Result<std::string> start_capture(const CaptureRequest& request);
+  /// @param acknowledge  see CaptureSession::start
+  Result<std::string> start_capture(const CaptureRequest& request, CaptureSession::Acknowledge acknowledge = {});
   Result<void> cancel_capture(const std::string& capture);
   /// @param done  called when nothing is left, from another thread or at once
   Result<void> delete_capture(const std::string& capture, std::function<void(Result<void>)> done);
@@ -178,6 +180,7 @@ class Booth {
   Result<void> open_stores();
   void open_capture(const Devices& devices);
   void adopt_orphans();
+  void name_interrupted();
   void set_state(BoothState state);
   void refresh();
   CamerasDiscovered look_for_cameras() const;
@@ -206,6 +209,7 @@ class Booth {
 
   std::unique_ptr<JobQueue> jobs_;
   std::unique_ptr<AvatarStore> avatars_;
+  std::unique_ptr<CaptureJournal> journal_;
   SerialExecutor disk_executor_;  ///< its tasks use the two above
   std::unique_ptr<BackgroundStore> backgrounds_;
   TaskBoard tasks_{events_};

@@ -22,6 +22,7 @@
 #include <system_error>
 
 #include "config/booth_config.h"
+#include "config/migration.h"
 #include "daemon/api/server.h"
 #include "daemon/booth.h"
 #include "daemon/log.h"
@@ -43,7 +44,7 @@ constexpr std::chrono::microseconds default_silence = std::chrono::seconds(30);
 
 struct Arguments {
   std::string config_file, reconstruct_command;
-  bool check = false, rest = false;
+  bool check = false, rest = false, migrate = false;
 };
 
 /// Signals that end the service come through a descriptor. To be made before any other thread.
@@ -131,6 +132,25 @@ int bring_to_rest(const BoothConfig& config) {
   return exit_failed;
 }
 
+/// Brings the file up to date where it is older. @return whether it is now
+bool migrate(const fs::path& file) {
+  const auto migrated = migrate_config_file(file);
+  if (migrated) {
+    if (!migrated->empty()) spdlog::info("{}", *migrated);
+    return true;
+  }
+  if (migrated.error().code == ErrorCode::unsupported) {
+    spdlog::error("{}", migrated.error().message);
+    return false;
+  }
+  spdlog::warn(
+      "{}; the configuration is of an older version, and is used as it would be migrated: call boothd --migrate with "
+      "the "
+      "right to change it",
+      migrated.error().message);
+  return false;
+}
+
 int run(const Arguments& arguments) {
   BoothOptions options;
   options.reconstruct_command = arguments.reconstruct_command.empty() ? beside_this_program("booth-reconstruct")
@@ -139,12 +159,14 @@ int run(const Arguments& arguments) {
   set_up_log(LogLevel::info);
   if (!arguments.config_file.empty()) {
     options.config_file = fs::absolute(arguments.config_file);
+    if (arguments.migrate) return migrate(options.config_file) ? 0 : exit_config;
     auto config = load_config(options.config_file);
     if (!config) {
       spdlog::error("{}", config.error().message);
       return exit_config;
     }
     options.config = std::move(*config);
+    if (!arguments.check && !arguments.rest) migrate(options.config_file);
   }
   set_up_log(options.config.log.level);
   if (arguments.rest) return bring_to_rest(options.config);
@@ -197,6 +219,8 @@ int main(int argc, char** argv) {
   app.add_option("--reconstruct", arguments.reconstruct_command,
                  "program that makes avatars; by default booth-reconstruct beside this one");
   app.add_flag("--check", arguments.check, "only check the configuration");
+  app.add_flag("--migrate", arguments.migrate, "only bring an older configuration file up to date")
+      ->needs(app.get_option("--config"));
   app.add_flag("--rest", arguments.rest, "only bring output lines to rest, after a service that was killed");
   app.set_version_flag("--version", BOOTH_VERSION);
   try {

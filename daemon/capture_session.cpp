@@ -70,6 +70,8 @@ CaptureSession::CaptureSession(CaptureParts parts)
 CaptureSession::~CaptureSession() {
   drain(std::chrono::milliseconds(0));
   thread_.request_stop();
+  thread_.join();
+  end_announced();
 }
 
 std::optional<DeviceStatus> CaptureSession::projector() const {
@@ -94,11 +96,12 @@ std::optional<std::string> CaptureSession::occupation() const {
   return "capture " + operation_->id + " is under way";
 }
 
-Result<std::string> CaptureSession::start(const CaptureRequest& request) {
+Result<std::string> CaptureSession::start(const CaptureRequest& request, Acknowledge acknowledge) {
   if (request.face == FaceMode::active && !projector_)
     return Error{ErrorCode::unsupported, "this booth has no projector: choose the face mode passive or none"};
   const std::string id = make_capture_id(std::chrono::system_clock::now());
-  const auto begun = begin(id, request, request.countdown_s > 0 ? BoothState::countdown : BoothState::capturing);
+  const auto begun = begin({.id = id, .request = request, .stop = {}, .acknowledge = std::move(acknowledge)},
+                           request.countdown_s > 0 ? BoothState::countdown : BoothState::capturing);
   if (!begun) return begun.error();
   return id;
 }
@@ -122,19 +125,25 @@ Result<std::string> CaptureSession::calibrate_projector() {
 Result<std::string> CaptureSession::begin_task(TaskKind kind, const Request& request, BoothState state) {
   if (const auto busy = occupation()) return Error{ErrorCode::busy, *busy};
   const std::string task = parts_.tasks.begin(kind);
-  const auto begun = begin(task, request, state);
+  const auto begun = begin({.id = task, .request = request, .stop = {}}, state);
   if (begun) return task;
   parts_.tasks.finish(task, begun.error());
   return begun.error();
 }
 
-Result<void> CaptureSession::begin(const std::string& id, const Request& request, BoothState state) {
+Result<void> CaptureSession::begin(Operation operation, BoothState state) {
   const std::lock_guard transition(transition_mutex_);
   if (const auto busy = occupation()) return Error{ErrorCode::busy, *busy};
+  if (operation.is_capture())
+    if (const auto noted = parts_.journal.begin(operation.id); !noted) return noted;
+  bool taken = false;
   {
     const std::lock_guard lock(mutex_);
-    if (draining_) return Error{ErrorCode::not_ready, "the booth is stopping"};
-    operation_ = Operation{.id = id, .request = request, .stop = {}};
+    if (taken = !draining_; taken) operation_ = operation;
+  }
+  if (!taken) {
+    if (operation.is_capture()) end_journal(operation.id);
+    return Error{ErrorCode::not_ready, "the booth is stopping"};
   }
   // Before the thread may see it: the states that it sets come after this one.
   parts_.set_state(state);
@@ -199,14 +208,18 @@ void CaptureSession::run(const std::stop_token& stop) {
     }
     try {
       if (operation)
-        std::visit([&](const auto& request) { carry_out(operation->id, request, operation->stop.get_token()); },
-                   operation->request);
+        std::visit([&](const auto& request) { carry_out(*operation, request); }, operation->request);
       else
-        tend_devices();
+        tend_devices(), end_announced();
     } catch (const std::exception& fault) {
       spdlog::error("the capture thread: {}", fault.what());
     }
   }
+}
+
+void CaptureSession::end_announced() {
+  for (const std::string& id : announced_) end_journal(id);
+  announced_.clear();
 }
 
 void CaptureSession::tend_devices() {
@@ -217,15 +230,15 @@ void CaptureSession::tend_devices() {
 }
 
 template <class TaskRequest>
-void CaptureSession::carry_out(const std::string& id, const TaskRequest& request, const std::stop_token& cancelled) {
+void CaptureSession::carry_out(const Operation& operation, const TaskRequest& request) {
   Result<TaskResult> result = was_cancelled();
   try {
-    result = work(id, request, cancelled);
+    result = work(operation.id, request, operation.stop.get_token());
   } catch (const std::exception& fault) {
     result = Error{ErrorCode::internal, "the booth's program has a fault: " + std::string(fault.what())};
   }
   end_operation(false);
-  parts_.tasks.finish(id, result);
+  parts_.tasks.finish(operation.id, result);
 }
 
 /// @param failed  it was a capture, of which somebody may still ask what became of it
@@ -241,12 +254,31 @@ void CaptureSession::end_operation(bool failed) {
   parts_.set_state(BoothState::idle);
 }
 
-void CaptureSession::carry_out(const std::string& id, const CaptureRequest& request, const std::stop_token& cancelled) {
+Result<void> CaptureSession::acknowledge(const Operation& operation) const {
+  const auto noted = parts_.journal.sync(operation.id);
+  if (operation.acknowledge)
+    operation.acknowledge(noted ? Result<std::string>(operation.id) : Result<std::string>(noted.error()));
+  return noted;
+}
+
+bool CaptureSession::is_draining() const {
+  const std::lock_guard lock(mutex_);
+  return draining_;
+}
+
+void CaptureSession::end_journal(const std::string& id) const {
+  // An entry that stays is looked into at the next start.
+  if (const auto ended = parts_.journal.end(id); !ended) spdlog::warn("{}", ended.error().message);
+}
+
+void CaptureSession::carry_out(const Operation& operation, const CaptureRequest& request) {
+  const std::string& id = operation.id;
   spdlog::info("capture {}: started", id);
   const Timestamp started = parts_.clock.now();
   Result<void> taken;
   try {
-    taken = take(id, request, cancelled);
+    taken = acknowledge(operation);
+    if (taken) taken = take(id, request, operation.stop.get_token());
   } catch (const std::exception& fault) {
     taken = Error{ErrorCode::internal, "the booth's program has a fault: " + std::string(fault.what())};
   }
@@ -258,6 +290,8 @@ void CaptureSession::carry_out(const std::string& id, const CaptureRequest& requ
     parts_.metrics.add("captures_failed");
     spdlog::warn("capture {}: failed: {}: {}", id, to_string(taken.error().code), taken.error().message);
     parts_.events.publish(CaptureFailed{id, taken.error()});
+    // Who no longer hears that, because the booth stops or is killed now, is told after the next start.
+    if (!is_draining()) announced_.push_back(id);
     return;
   }
   // Without its file the job would be made anew at the next start: nothing is lost.
@@ -268,6 +302,7 @@ void CaptureSession::carry_out(const std::string& id, const CaptureRequest& requ
   spdlog::info("capture {}: done", id);
   parts_.events.publish(CaptureDone{id, id});
   parts_.jobs.release(id);  // so that listeners hear of the capture's end before the job's beginning
+  end_journal(id);
 }
 
 /// The capture is over. @return whether its recording stays, and its job is queued

@@ -18,6 +18,7 @@
 #include "daemon/background_store.h"
 #include "daemon/calibration_desk.h"
 #include "daemon/camera_supervisor.h"
+#include "daemon/capture_journal.h"
 #include "daemon/device_slot.h"
 #include "daemon/empty_booth.h"
 #include "daemon/event_bus.h"
@@ -72,6 +73,7 @@ struct CaptureParts {
   TaskBoard& tasks;
   BackgroundStore& backgrounds;
   CalibrationDesk& calibration;
+  const CaptureJournal& journal;
   std::function<std::vector<BoothDevice>()> devices;  ///< every camera
   JobQueue& jobs;
   EventBus& events;
@@ -92,8 +94,14 @@ class CaptureSession {
   explicit CaptureSession(CaptureParts parts);
   ~CaptureSession();
 
-  /// Begins a capture. @return its id; @error busy  another one is under way
-  Result<std::string> start(const CaptureRequest& request);
+  /// Takes the id of a capture that began and is on the disk, so that whatever happens now it will be there or be named
+  /// as failed; or why it failed at once. From another thread.
+  using Acknowledge = std::function<void(const Result<std::string>&)>;
+
+  /// Begins a capture, which a SIGKILL from now on does not make forgotten.
+  /// @param acknowledge  called once, when a power cut does not either, unless start() fails
+  /// @return its id; @error busy  another one is under way; disk_full, io  it cannot be written down
+  Result<std::string> start(const CaptureRequest& request, Acknowledge acknowledge = {});
   /// Begins a task. @return its id; @error busy, not_calibrated
   Result<std::string> learn_background(const BackgroundRequest& request);
   /// Likewise. @error busy
@@ -128,19 +136,24 @@ class CaptureSession {
     std::string id;  ///< the capture's, or the task's
     Request request;
     std::stop_source stop;
-    bool stoppable = true;    ///< nobody stands there yet: stopping the booth need not wait for it
-    bool committing = false;  ///< it can no longer be cancelled
+    Acknowledge acknowledge = {};  ///< of a capture; may be empty
+    bool stoppable = true;         ///< nobody stands there yet: stopping the booth need not wait for it
+    bool committing = false;       ///< it can no longer be cancelled
     bool abandoned = false;
     bool is_capture() const { return std::holds_alternative<CaptureRequest>(request); }
   };
   void run(const std::stop_token& stop);
   void tend_devices();
-  Result<void> begin(const std::string& id, const Request& request, BoothState state);
+  Result<void> begin(Operation operation, BoothState state);
   Result<std::string> begin_task(TaskKind kind, const Request& request, BoothState state);
   void end_operation(bool failed);
-  void carry_out(const std::string& id, const CaptureRequest& request, const std::stop_token& cancelled);
+  void carry_out(const Operation& operation, const CaptureRequest& request);
   template <class TaskRequest>
-  void carry_out(const std::string& id, const TaskRequest& request, const std::stop_token& cancelled);
+  void carry_out(const Operation& operation, const TaskRequest& request);
+  Result<void> acknowledge(const Operation& operation) const;
+  bool is_draining() const;
+  void end_announced();
+  void end_journal(const std::string& id) const;
   bool conclude(const std::string& id, const CaptureRequest& request, bool taken);
 
   // The steps of a capture, in their order.
@@ -198,6 +211,7 @@ class CaptureSession {
   bool pending_ = false;                ///< guarded by mutex_; it waits for the thread
   bool draining_ = false;               ///< guarded by mutex_
   std::deque<std::string> over_;        ///< guarded by mutex_; captures of this boot that failed, the newest last
+  std::vector<std::string> announced_;  ///< of the thread; captures that failed: their events are on their way
   std::jthread thread_;
 };
 

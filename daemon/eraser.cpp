@@ -35,10 +35,12 @@ void unmark(const fs::path& state, const std::string& id) { ::unlink((marks_of(s
 
 }  // namespace
 
-Eraser::Eraser(const fs::path& state, JobQueue& jobs, AvatarStore& avatars, CaptureSession* session, EventBus& events)
+Eraser::Eraser(const fs::path& state, JobQueue& jobs, AvatarStore& avatars, const CaptureJournal& journal,
+               CaptureSession* session, EventBus& events)
     : state_(state),
       jobs_(jobs),
       avatars_(avatars),
+      journal_(journal),
       session_(session),
       events_(events),
       executor_("eraser", most_waiting) {}
@@ -55,6 +57,7 @@ Result<void> Eraser::finish_interrupted(const fs::path& state) {
       for (const char* folder : {"recordings", "avatars"})
         if (const auto removed = remove_folder(state / folder, id); !removed) return removed;
       ::unlink((state / "jobs" / (id + ".json")).c_str());
+      ::unlink((state / "capturing" / id).c_str());
     }
     unmark(state, id);
   }
@@ -94,6 +97,7 @@ Result<void> Eraser::remove(const std::string& id) {
   if (const auto removed = avatars_.remove(id); !removed) return removed;
   if (const auto removed = remove_folder(state_ / "recordings", id); !removed) return removed;
   if (const auto removed = jobs_.persist(id); !removed) return removed;
+  if (const auto removed = journal_.end(id); !removed) return removed;
   unmark(state_, id);
   spdlog::info("{}: deleted", id);
   return {};

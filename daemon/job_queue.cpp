@@ -38,7 +38,8 @@ std::string write_job(const Job& job) {
             {"label", job.label},
             {"state", to_string(job.state)},
             {"interrupted", job.interrupted},
-            {"died", job.died}};
+            {"died", job.died},
+            {"recorded", job.recorded}};
   if (job.error) json["error"] = {{"kind", job.error->kind}, {"message", job.error->message}};
   return json.dump(2, ' ', false, Json::error_handler_t::replace) + "\n";
 }
@@ -53,6 +54,7 @@ std::optional<Job> parse_job(const std::vector<uint8_t>& bytes, const std::strin
     job.label = json.value("label", "");
     job.interrupted = json.value("interrupted", 0);
     job.died = json.value("died", 0);
+    job.recorded = json.value("recorded", true);
     if (const auto error = json.find("error"); error != json.end() && error->is_object())
       job.error = Reason{error->value("kind", "internal"), error->value("message", "it is not known why")};
     const auto state = job_state_from(json.at("state").get<std::string>());
@@ -159,6 +161,9 @@ Result<void> JobQueue::retry(const std::string& id) {
     if (job.state != JobState::failed && job.state != JobState::cancelled)
       return Error{ErrorCode::invalid_state, "job " + id + " is " + std::string(to_string(job.state)) +
                                                  "; only a failed or cancelled one can be retried"};
+    if (!job.recorded)
+      return Error{ErrorCode::invalid_state,
+                   "capture " + id + " was not finished, there is nothing to retry: take it again"};
     job = Job{.id = job.id, .face = job.face, .label = job.label};
     found->second.lease = 0;
   }

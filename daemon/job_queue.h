@@ -29,8 +29,9 @@ struct Job {
   std::string stage = {};  ///< the last one reported; empty before the first
   double fraction = 0;     ///< of the whole job
   std::optional<Reason> error = {};
-  int interrupted = 0;  ///< how often the daemon died while it ran
-  int died = 0;         ///< how often its own process died, hung, or took more memory than it may
+  int interrupted = 0;   ///< how often the daemon died while it ran
+  bool recorded = true;  ///< false: the capture ended with the daemon, and there is nothing to reconstruct
+  int died = 0;          ///< how often its own process died, hung, or took more memory than it may
 };
 
 /// The jobs, one file each, so that they survive the daemon. Changes take effect in memory at once and block
@@ -56,7 +57,7 @@ class JobQueue {
   void release(const std::string& id);
   /// What a done job made is gone: it is queued again. Other jobs are left alone.
   void redo(const std::string& id);
-  /// @error not_found; invalid_state  neither failed nor cancelled
+  /// @error not_found; invalid_state  neither failed nor cancelled, or nothing was recorded
   Result<void> retry(const std::string& id);
   /// The job is cancelled from now on; a worker that has it sees so by is_wanted.
   /// @error not_found; invalid_state  over already

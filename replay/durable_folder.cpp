@@ -230,6 +230,8 @@ Result<void> write_file_atomically(const fs::path& file, std::string_view text) 
   return write_file_atomically(file, bytes_of(text));
 }
 
+Result<void> flush_to_disk(const fs::path& path) { return flush(path, O_RDONLY); }
+
 Result<int> remove_partial_folders(const fs::path& parent) {
   std::error_code code;
   fs::directory_iterator entry(parent, code);

@@ -65,6 +65,9 @@ class DurableFolder {
 Result<void> write_file_atomically(const std::filesystem::path& file, std::span<const uint8_t> bytes);
 Result<void> write_file_atomically(const std::filesystem::path& file, std::string_view text);
 
+/// Brings a file or a folder, not what is in it, to the disk, and waits for that. @error disk_full, io
+Result<void> flush_to_disk(const std::filesystem::path& path);
+
 /// Removes what killed processes left in `parent` (not below it): folders under construction or being deleted, and
 /// temporary files. What a living process is building is left alone. A missing parent is no error.
 /// @return how many were removed; @error io

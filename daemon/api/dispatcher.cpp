@@ -121,7 +121,7 @@ std::optional<Reply> Dispatcher::dispatch(Method method, const Json& params, con
     case Method::calibration_discard:
     case Method::calibration_restore:
     case Method::calibration_status: calibrate(method, params, respond); break;
-    case Method::capture_start: respond(start_capture(params)); break;
+    case Method::capture_start: return start_capture(params, respond);
     case Method::capture_cancel:
       if (const auto request = parse_id(params, "capture"); !refused(request, respond)) {
         const auto cancelled = booth_.cancel_capture(request->id);
@@ -190,12 +190,15 @@ Answer Dispatcher::status() const {
 
 Answer Dispatcher::metrics() const { return Reply{booth_.measurements()}; }
 
-Answer Dispatcher::start_capture(const Json& params) {
+std::optional<Reply> Dispatcher::start_capture(const Json& params, const Responder& respond) {
   const auto request = parse_capture_start(params);
-  if (!request) return request.error();
-  const auto started = booth_.start_capture(*request);
-  if (!started) return started.error();
-  return Reply{{{"capture", *started}}};
+  if (refused(request, respond)) return std::nullopt;
+  const auto answer = [](const std::string& id) { return Reply{{{"capture", id}}}; };
+  const auto started = booth_.start_capture(*request, [respond, answer](const Result<std::string>& id) {
+    respond(id ? Answer(answer(*id)) : Answer(id.error()));
+  });
+  if (refused(started, respond)) return std::nullopt;
+  return answer(*started);
 }
 
 Answer Dispatcher::start_preview(const Json& params) {

@@ -45,7 +45,7 @@ class Dispatcher {
   Answer metrics() const;
   Answer list_jobs(const nlohmann::json& params);
   Answer list_avatars(const nlohmann::json& params);
-  Answer start_capture(const nlohmann::json& params);
+  std::optional<Reply> start_capture(const nlohmann::json& params, const Responder& respond);
   Answer start_preview(const nlohmann::json& params);
   Answer stop_preview(const nlohmann::json& params);
   Answer learn_background(const nlohmann::json& params);

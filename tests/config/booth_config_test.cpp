@@ -52,7 +52,7 @@ std::vector<std::string> keys_of(const std::string& text) {
     else if (std::regex_search(line, match, std::regex(R"(^\[([a-z_.]+)\])")))
       section = match[1].str();
     else if (std::regex_search(line, match, std::regex(R"(^([a-z_]+) = )")))
-      keys.push_back(section + "." + match[1].str());
+      keys.push_back(section + (section.empty() ? "" : ".") + match[1].str());
   }
   return keys;
 }
@@ -559,7 +559,8 @@ TEST(ParseConfig, ReportsEveryFaultWithItsPathValueAndWhatWouldDo) {
       triangles = 9999999999999
       )"),
       testing::UnorderedElementsAre(
-          "colour: \"red\", expected one of the keys booth, api, capture, background, calibration, disk, retention, jobs, log, cameras, "
+          "colour: \"red\", expected one of the keys version, booth, api, capture, background, calibration, disk, "
+          "retention, jobs, log, cameras, "
           "trigger, "
           "projector, replay, "
           "face, reconstruct, export",

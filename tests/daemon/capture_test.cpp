@@ -29,7 +29,7 @@ class Capture : public TestBooth {
     return end->topic == "capture.done" ? "done" : end->fields["kind"].get<std::string>();
   }
   void expect_nothing_left(const std::string& id) {
-    EXPECT_THAT(traces(id), IsEmpty());
+    EXPECT_TRUE(wait_until([&] { return traces(id).empty(); })) << traces(id)[0];
     EXPECT_TRUE(wait_until([&] { return call("system.status")["state"] == "idle"; }));
     EXPECT_EQ(call("system.status")["ready"], true);
   }
@@ -288,6 +288,42 @@ TEST_F(Capture, DeletedAtAnyMomentLeavesNothing) {
     EXPECT_EQ(job(id)["state"], "not_found");
   }
   EXPECT_THAT(call("avatar.list")["avatars"], IsEmpty());
+}
+
+TEST_F(Capture, IsWrittenDownFromItsAcknowledgementToItsEnd) {
+  start_listening();
+  const fs::path folder = options_.config.booth.captures_under_way();
+  const std::string cancelled = capture({{"countdown_s", 30}});
+  EXPECT_THAT(entries(folder), ElementsAre(cancelled));
+  EXPECT_EQ(refusal("capture.start"), "busy");
+  EXPECT_THAT(entries(folder), ElementsAre(cancelled)) << "nothing of one that was refused";
+  call("capture.cancel", {{"capture", cancelled}});
+  EXPECT_EQ(end_of(cancelled), "cancelled");
+  EXPECT_TRUE(wait_until([&] { return entries(folder).empty(); }));
+  ASSERT_TRUE(wait_until([&] { return call("system.status")["ready"] == true; }));
+  EXPECT_EQ(end_of(capture()), "done");
+  EXPECT_TRUE(wait_until([&] { return entries(folder).empty(); }));
+}
+
+TEST_F(Capture, WhatCannotBeWrittenDownIsRefused) {
+  start_listening();
+  fs::remove(options_.config.booth.captures_under_way());
+  EXPECT_EQ(refusal("capture.start"), "internal");
+  EXPECT_EQ(call("system.status")["state"], "idle");
+  fs::create_directory(options_.config.booth.captures_under_way());
+  EXPECT_EQ(end_of(capture()), "done");
+}
+
+TEST_F(Capture, OnlyTheLatestInterruptedCapturesAreKept) {
+  const fs::path folder = options_.config.booth.captures_under_way();
+  fs::create_directories(folder);
+  for (int i = 0; i < 120; ++i) std::ofstream(folder / ("capture-" + std::to_string(1000 + i)));
+  start_listening();
+  const Json jobs = call("job.list")["jobs"];
+  ASSERT_THAT(jobs, SizeIs(100));
+  EXPECT_EQ(jobs[0]["id"], "capture-1020");
+  EXPECT_EQ(jobs[99]["state"], "failed");
+  EXPECT_THAT(entries(folder), IsEmpty());
 }
 
 TEST_F(Capture, TwoBoothsInOneProcess) {

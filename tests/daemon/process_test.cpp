@@ -14,6 +14,9 @@ namespace {
 using testing::IsEmpty;
 using testing::SizeIs;
 
+/// What is said of a capture that ended with the process.
+constexpr const char* interrupted = "the booth was stopped while capturing";
+
 /// The real programs, as processes of their own.
 class Process : public TestBooth {
  protected:
@@ -84,28 +87,78 @@ class Process : public TestBooth {
 TEST_F(Process, KilledAtAnyMomentLosesNothingThatWasDone) {
   constexpr int rounds = 12;
   std::mt19937 random(7);
-  std::set<std::string> done;
+  std::set<std::string> acknowledged, done;
   reconstruct_.behave("slow");
   for (int round = 0; round < rounds; ++round) {
     start_boothd();
     const Json jobs = call("job.list");
-    for (const Json& job : jobs["jobs"]) EXPECT_NE(job["state"], "failed") << job;
-    capture();
+    for (const Json& job : jobs["jobs"]) {
+      if (job["state"] != "failed") continue;
+      EXPECT_EQ(job["error"]["message"], interrupted) << job;
+    }
+    acknowledged.insert(capture());
     const auto until = std::chrono::steady_clock::now() + std::chrono::milliseconds(random() % 400);
     while (std::chrono::steady_clock::now() < until)
-      if (const Json now = call("job.list"); !now["jobs"].empty()) done.insert(now["jobs"].back()["id"]);
+      if (const Json now = call("job.list"); !now["jobs"].empty() && now["jobs"].back()["state"] != "failed")
+        done.insert(now["jobs"].back()["id"]);
     ::kill(boothd_, SIGKILL);
     wait_exit();
     expect_all_whole();
   }
   start_boothd();
-  ASSERT_TRUE(wait_until([&] { return call("system.status")["queue"].empty(); }));
+  for (const std::string& id : acknowledged)
+    if (!done.contains(id) && job(id)["state"] != "failed") done.insert(id);
+  for (const std::string& id : done) EXPECT_TRUE(wait_job(id, "done")) << job(id);
   EXPECT_TRUE(wait_until([&] { return traces(".partial").empty(); }));
   std::set<std::string> avatars;
   const Json list = call("avatar.list");
   for (const Json& avatar : list["avatars"]) avatars.insert(avatar["id"]);
   for (const std::string& id : done) EXPECT_EQ(avatars.count(id), 1) << id << " was lost";
   EXPECT_THAT(entries(options_.config.booth.recordings()), SizeIs(avatars.size()));
+}
+
+TEST_F(Process, AnAcknowledgedCaptureIsThereOrNamedAsFailed) {
+  constexpr int rounds = 10;
+  std::mt19937 random(23);
+  std::vector<std::string> acknowledged, failed;
+  for (int round = 0; round < rounds; ++round) {
+    start_boothd();
+    // Any instant until it is recorded, and some in the countdown, where it surely is not.
+    const bool counting = round % 3 == 0;
+    acknowledged.push_back(capture({{"face", counting ? "none" : "auto"}, {"countdown_s", counting ? 5 : 0}}));
+    std::this_thread::sleep_for(std::chrono::milliseconds(random() % 60));
+    ::kill(boothd_, SIGKILL);
+    wait_exit();
+  }
+  start_boothd();
+  for (const std::string& id : acknowledged) {
+    ASSERT_NE(job(id)["state"], "not_found") << id << " is forgotten";
+    if (job(id)["state"] != "failed") {
+      EXPECT_TRUE(wait_job(id, "done")) << job(id);
+      continue;
+    }
+    EXPECT_EQ(job(id)["error"]["message"], interrupted);
+    EXPECT_EQ(job(id)["error"]["kind"], "internal");
+    EXPECT_EQ(refusal("job.retry", {{"job", id}}), "invalid_state");
+    EXPECT_EQ(refusal("capture.cancel", {{"capture", id}}), "invalid_state");
+    failed.push_back(id);
+  }
+  EXPECT_THAT(failed, testing::Contains(acknowledged[0]));
+  const Json queue = call("system.status")["queue"];
+  EXPECT_THAT(queue, SizeIs(failed.size()));
+  EXPECT_EQ(queue[0]["id"], failed[0]);
+  call("capture.delete", {{"capture", failed[0]}});
+  EXPECT_THAT(traces(failed[0]), IsEmpty());
+  EXPECT_EQ(job(failed[0])["state"], "not_found");
+}
+
+TEST_F(Process, ACaptureThatTheEndOfTheServiceCancelsIsNamedAfterwards) {
+  start_boothd();
+  const std::string id = capture({{"countdown_s", 30}});
+  ::kill(boothd_, SIGTERM);
+  EXPECT_EQ(wait_exit(), 0);
+  start_boothd();
+  EXPECT_EQ(job(id)["error"]["message"], interrupted);
 }
 
 TEST_F(Process, WhatWasDeletedStaysDeletedWhenKilled) {

@@ -35,6 +35,8 @@ SESSION_WITHIN_S = 60
 SWEPT_WITHIN_S = 20
 MOST_KEPT = 12  # captures; the oldest are deleted, as a test of their own
 
+INTERRUPTED = "the booth was stopped while capturing"
+
 OFF, FAIL, TEAR, KILL_SELF, KILL_ALL = range(5)
 
 
@@ -82,7 +84,8 @@ class Campaign:
             "FAULT_ROOT": str(self.booth.state), "FAULT_LOG": str(folder / "operations"),
             # A sanitizer's library wants to be the first one, which need not be.
             "ASAN_OPTIONS": os.environ.get("ASAN_OPTIONS", "") + ":verify_asan_link_order=0"}
-        self.acknowledged, self.refused, self.deleted = set(), {}, set()
+        self.begun, self.acknowledged, self.refused, self.deleted = set(), set(), {}, set()
+        self.interrupted = 0
         self.found = []  # (what was done, what was wrong)
         self.injected = collections.Counter()
         self.checks = self.failed_jobs = 0
@@ -104,13 +107,19 @@ class Campaign:
     def session(self, face="auto"):
         """One capture, followed until its avatar is there, it has failed, or the booth is dead."""
         with contextlib.suppress(TimeoutError, Refused):
-            capture = self.booth.call("capture.start", face=face, label="Ann Other")["capture"]
+            capture = self.begin(face=face, label="Ann Other")
             deadline = time.monotonic() + SESSION_WITHIN_S
             while capture not in self.listen(0.05) and not self.is_over(capture):
                 if self.booth.process.poll() is not None:
                     return
                 if time.monotonic() > deadline:
                     raise AssertionError("neither an avatar nor a failure came")
+
+    def begin(self, **how):
+        """Starts a capture: from now on it must be there, or be named as failed."""
+        capture = self.booth.call("capture.start", **how)["capture"]
+        self.begun.add(capture)
+        return capture
 
     def is_over(self, capture):
         """Asked, for an event may have come before the subscription had."""
@@ -156,6 +165,14 @@ class Campaign:
         state = self.booth.state
         # A job that failed under a fault is named, and can be done again.
         failed = [j for j in self.booth.call("job.list")["jobs"] if j["state"] == "failed"]
+        for job in [j for j in failed if j["error"]["message"] == INTERRUPTED]:
+            # Named, and dismissed by the front end.
+            failed.remove(job)
+            self.interrupted += 1
+            if job["id"] in self.acknowledged:
+                wrong.append(f"LOST: capture {job['id']} was done, and is named as interrupted")
+            self.refused[job["id"]] = INTERRUPTED
+            self.booth.call("capture.delete", capture=job["id"])
         self.failed_jobs += len(failed)
         for job in failed:
             if not job["error"] or not job["error"]["message"]:
@@ -167,6 +184,9 @@ class Campaign:
                                for folder in ("recordings", "avatars"))
         jobs = {j["id"]: j for j in self.booth.call("job.list")["jobs"]}
         listed = {a["id"] for a in self.booth.call("avatar.list", limit=500)["avatars"]}
+        for capture in self.begun - self.acknowledged - self.deleted - set(self.refused) - set(recordings):
+            wrong.append(f"LOST: capture {capture} was begun, and nobody says what became of it")
+        self.begun.clear()
         for capture in self.acknowledged:
             job = jobs.get(capture)
             if capture not in recordings or job is None:
@@ -231,7 +251,7 @@ class Campaign:
             def during():
                 self.booth.behave("good", 0.15)
                 with contextlib.suppress(TimeoutError, Refused):
-                    self.booth.call("capture.start", face=self.random.choice(["auto", "none"]))
+                    self.begin(face=self.random.choice(["auto", "none"]))
                     if self.acknowledged and self.random.random() < 0.2:
                         capture = self.random.choice(sorted(self.acknowledged))
                         self.booth.call("capture.delete", capture=capture)
@@ -266,7 +286,7 @@ class Campaign:
             seconds = self.random.uniform(0.2, 6)
 
             def during():
-                self.booth.call("capture.start", face="none")
+                self.begin(face="none")
                 until = time.monotonic() + seconds
                 while time.monotonic() < until:
                     self.listen(0.02)
@@ -361,7 +381,7 @@ class Campaign:
                 self.booth.behave("good", 0.05)
                 for _ in range(2):
                     with contextlib.suppress(TimeoutError, Refused):
-                        self.booth.call("capture.start", face="none", key=f"{seconds} {_}")
+                        self.begin(face="none", key=f"{seconds} {_}")
                         time.sleep(self.random.uniform(0, 0.1))
                     self.control["clock_step_ns"] = int(seconds * 1e9)
                     self.injected["clock steps"] += 1
@@ -424,6 +444,7 @@ class Campaign:
             print(f"{count:6} {fault}")
         lost = sum(text.startswith("LOST") for _, wrong in self.found for text in wrong)
         print(f"{sum(self.injected.values()):6} faults injected, {self.checks} restarts checked, "
+              f"{self.interrupted} captures named as interrupted, "
               f"{self.failed_jobs} jobs named as failed and done again, {lost} captures lost, "
               f"{len(self.found)} findings")
         return 1 if self.found else 0

@@ -66,8 +66,11 @@ grep -q '"boot"' "$scratch/status" || fail "no status"
 ask shutdown
 wait "$boothd" || { cat "$scratch/boothd.log"; fail "the installed booth did not end well"; }
 
-# The operator's own settings and choices outlive an upgrade.
-echo '# mine' >>"$root/etc/booth/boothd.toml"
+# The operator's own settings and choices outlive an upgrade, those of an older version too.
+config=$root/etc/booth/boothd.toml
+sed -i '/^version = /d' "$config"
+printf '[drivers]\ncamera = "replay"\n# mine\n' >>"$config"
+cp "$config" "$scratch/older.toml"
 systemctl --root="$root" disable --quiet boothd.service
 mkdir -p "$root/var/lib/booth/avatars/somebody" "$root/etc/booth/keys/clients"
 dpkg-deb -R "$deb" "$scratch/next"
@@ -75,7 +78,10 @@ sed -i 's/^Version: .*/&+1/' "$scratch/next/DEBIAN/control"
 echo '# of the new version' >>"$scratch/next/etc/booth/boothd.toml"
 dpkg-deb --root-owner-group -b "$scratch/next" "$scratch/next.deb" >/dev/null
 install -i "$scratch/next.deb"
-grep -qx '# mine' "$root/etc/booth/boothd.toml" || fail "the operator's configuration was replaced"
+grep -qx '# mine' "$config" || fail "the operator's configuration was replaced"
+cmp -s "$scratch/older.toml" "$config.bak-1" || fail "the configuration of before is not kept"
+grep -qx 'version = 2' "$config" || fail "the configuration was not migrated"
+"$root/usr/bin/boothd" --config "$config" --check || fail "the migrated configuration is refused"
 [ -L "$root/etc/systemd/system/multi-user.target.wants/boothd.service" ] && fail "the service was enabled again"
 [ -d "$root/var/lib/booth/avatars/somebody" ] || fail "an upgrade took an avatar"
 
