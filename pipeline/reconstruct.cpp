@@ -11,6 +11,7 @@
 #include "pipeline/face/external_scan.h"
 #include "pipeline/face/face_evidence.h"
 #include "pipeline/face/face_patch.h"
+#include "pipeline/face/face_pictures.h"
 #include "pipeline/face/face_sewing.h"
 #include "pipeline/face/field_fusion.h"
 #include "pipeline/geometry/solid_parts.h"
@@ -217,12 +218,13 @@ Result<FaceSurface> fit_face(const VisualHull& hull, std::span<const Frame> fram
   if (!head) return Error{ErrorCode::no_subject, "no head was found"};
   const auto controls = find_control_points(*hull.rig, frames, *head, *model->landmarks, options.control_points, work);
   if (!controls) return controls.error();
-  auto fitted = fit_neutral_head(*model->neutral, *controls, hull.views, hull.field, options.head_fit, work);
+  const std::vector<FacePicture> pictures = face_pictures(*hull.rig, frames, controls->frame, work);
+  auto fitted = fit_neutral_head(*model->neutral, *controls, pictures, hull.views, hull.field, options.head_fit, work);
   if (!fitted) return fitted.error();
   FacePatch patch = face_patch(*fitted);
   if (patch.core.mesh.triangles.empty())
     return Error{ErrorCode::no_subject, "hair or something else covers most of the face"};
-  const FaceEvidence evidence = weigh_face(*hull.rig, frames, *controls, surface, patch, hull.views, work);
+  const FaceEvidence evidence = weigh_face(pictures, *controls, surface, patch, hull.views, work);
   if (work.stopped()) return Work::cancelled();
   if (const auto objection = evidence.objection()) return Error{ErrorCode::no_subject, *objection};
   const Eigen::Vector3f eye = patch.eye;

@@ -6,29 +6,11 @@
 #include <limits>
 #include <vector>
 
-#include "pipeline/face/head_view.h"
 #include "pipeline/face/patch_matching.h"
 #include "pipeline/face/ray_caster.h"
 
 namespace booth {
 namespace {
-
-std::vector<PinholePicture> pictures_of(const Rig& rig, std::span<const Frame> frames,
-                                        const FaceControlPoints& controls) {
-  std::vector<PinholePicture> pictures;
-  constexpr double width_of_eye_distance = 4;
-  constexpr int width_px = 300;
-  for (const FaceObservation& seen : controls.observations) {
-    const RigCamera* camera = rig.find(seen.camera);
-    const auto frame =
-        std::find_if(frames.begin(), frames.end(), [&](const Frame& f) { return f.camera == seen.camera; });
-    if (camera == nullptr || frame == frames.end() || frame->pixels == nullptr) continue;
-    const auto view =
-        upright_view(*camera, controls.frame.middle, width_of_eye_distance * controls.frame.eye_distance_m, width_px);
-    if (view) pictures.push_back({*view, render_view(*camera, *frame->pixels, *view)});
-  }
-  return pictures;
-}
 
 /// Share of the patch, where it takes the hull's place, that an outline says is outside the subject.
 double share_outside(const FacePatch& fitted, const SilhouetteViews& views) {
@@ -58,11 +40,15 @@ std::optional<std::string> FaceEvidence::objection() const {
   return std::nullopt;
 }
 
-FaceEvidence weigh_face(const Rig& rig, std::span<const Frame> frames, const FaceControlPoints& controls,
-                        const Mesh& hull, const FacePatch& fitted, const SilhouetteViews& views, const Work& work) {
+FaceEvidence weigh_face(std::span<const FacePicture> seen, const FaceControlPoints& controls, const Mesh& hull,
+                        const FacePatch& fitted, const SilhouetteViews& views, const Work& work) {
   FaceEvidence evidence;
   evidence.outside_outline = share_outside(fitted, views);
-  const std::vector<PinholePicture> pictures = pictures_of(rig, frames, controls);
+  std::vector<PinholePicture> pictures;  // of cameras that know a face when they see it
+  for (const auto& [picture, matte] : seen)
+    if (std::any_of(controls.observations.begin(), controls.observations.end(),
+                    [&](const FaceObservation& observation) { return observation.camera == picture.view.id; }))
+      pictures.push_back(picture);
   if (pictures.size() < 2) return evidence;
   const auto frontal = [&](const PinholePicture& picture) {
     return (picture.view.center() - controls.frame.middle).normalized().dot(controls.frame.forward);

@@ -6,10 +6,9 @@
 
 #include "pipeline/face/control_points.h"
 #include "pipeline/face/face_patch.h"
+#include "pipeline/face/face_pictures.h"
 #include "pipeline/geometry/silhouette_view.h"
-#include "pipeline/types/frame.h"
 #include "pipeline/types/mesh.h"
-#include "pipeline/types/rig.h"
 #include "pipeline/types/work.h"
 
 namespace booth {
@@ -28,11 +27,11 @@ struct FaceEvidence {
 /// Looks at both surfaces through the cameras that see the face: where a surface is the true one, pictures agree on
 /// what is on it. Both are compared at the same places, along the sight of the most frontal of these cameras.
 ///
-/// @param frames    at most one per camera
-/// @param controls  its observations name the cameras
+/// @param seen      from face_pictures
+/// @param controls  its observations name the cameras that are compared
 /// @param hull      closed, world frame
 /// @param views     outlines, of any cameras
-FaceEvidence weigh_face(const Rig& rig, std::span<const Frame> frames, const FaceControlPoints& controls,
-                        const Mesh& hull, const FacePatch& fitted, const SilhouetteViews& views, const Work& work = {});
+FaceEvidence weigh_face(std::span<const FacePicture> seen, const FaceControlPoints& controls, const Mesh& hull,
+                        const FacePatch& fitted, const SilhouetteViews& views, const Work& work = {});
 
 }  // namespace booth

@@ -22,7 +22,7 @@ struct FacePatch {
 };
 
 struct FacePatchOptions {
-  double blend_m = 0.015;             ///< over which the weight falls, 0.002 … 0.05 metres
+  double blend_m = 0.010;             ///< over which the weight falls, 0.002 … 0.05 metres
   double smallest_cover_m2 = 0.0006;  ///< what covers less of the face is noise of the hull, square metres
 };
 

@@ -9,6 +9,7 @@
 #include <numeric>
 #include <optional>
 
+#include "pipeline/face/surface_matching.h"
 #include "pipeline/face/transformation_pyramids.h"
 
 namespace booth {
@@ -59,11 +60,13 @@ struct Target {
   Eigen::Matrix3d covariance;  ///< its own and the landmark's vagueness
 };
 
-/// @param normals  of the landmarks on the head, world frame
-std::vector<Target> targets_of(const FaceControlPoints& controls, const std::vector<Eigen::Vector3d>& normals) {
+/// @param normals   of the landmarks on the head, world frame
+/// @param contours  whether the jaw's are taken, too
+std::vector<Target> targets_of(const FaceControlPoints& controls, const std::vector<Eigen::Vector3d>& normals,
+                               bool contours) {
   std::vector<Target> targets;
   for (size_t i = 0; i < landmarks; ++i)
-    if (const auto& point = controls.points[i]) {
+    if (const auto& point = controls.points[i]; point && (contours || !is_contour_landmark(i))) {
       const auto [along, across] = vagueness_of(i);
       const Eigen::Matrix3d over = normals[i] * normals[i].transpose();
       targets.push_back(
@@ -372,10 +375,11 @@ std::vector<float> own_hull_gaps(const std::vector<HeadOutline>& outlines, const
 }
 
 /// How much farther out than it would be if the head were bare the hull is: hair, glasses, a hand. In 0 … 1, 1 = bare.
-std::vector<float> bareness(const NeutralHead& neutral, const std::vector<HeadOutline>& outlines, const Field& hull,
-                            const Mesh& head) {
+std::vector<float> bareness(const NeutralHead& neutral, const SilhouetteViews& views, const Mesh& aligned,
+                            const Field& hull, const Mesh& head) {
   const std::vector<Eigen::Vector3f> normals = vertex_normals(head);
-  const std::vector<float> expected = own_hull_gaps(outlines, head, normals);
+  // Of the head before it was bent: where it was drawn towards hair it has hollows that no face has.
+  const std::vector<float> expected = own_hull_gaps(head_outlines(views, aligned), aligned, vertex_normals(aligned));
   const std::vector<float> found = gaps_along_normals(head, normals, [&](const Eigen::Vector3f& p) {
     const Grid& grid = hull.grid();
     const Eigen::Vector3f at = (p - grid.origin.cast<float>()) / static_cast<float>(grid.voxel_m);
@@ -481,8 +485,10 @@ class OutlinePulls {
 /// Where the hull is close to the face, as its cameras see all of the face there, it holds the fit.
 class HullPulls {
  public:
-  HullPulls(const NeutralHead& neutral, const Field& hull, const std::vector<double>& areas, double scale)
-      : neutral_(neutral), hull_(hull), areas_(areas), scale_(scale) {}
+  /// @param pixel_m  what a pixel of the outlines is at the head
+  HullPulls(const NeutralHead& neutral, const Field& hull, const std::vector<double>& areas, double scale,
+            double pixel_m)
+      : neutral_(neutral), hull_(hull), areas_(areas), scale_(scale), sigma_m_(std::hypot(0.0015, 0.5 * pixel_m)) {}
 
   void add(const Positions& aligned, const Mesh& head, const std::vector<float>& gaps,
            const std::vector<Eigen::Vector3f>& normals, std::vector<Pull>* pulls) const {
@@ -506,7 +512,7 @@ class HullPulls {
       constexpr double alike = 0.7;
       if (way.dot(normals[i].cast<double>()) < alike) continue;
       const double residual = *here / slope.norm();
-      constexpr double sigma_m = 0.0015, alike_m = 0.01, scale_m = 0.003, gap_m = 0.0015;
+      constexpr double alike_m = 0.01, scale_m = 0.003, gap_m = 0.0015;
       const double trust = std::exp(-std::pow(static_cast<double>(gaps[i]) / gap_m, 2));
       const double spacing = scale_ * std::sqrt(areas_[i]);
       const double share =
@@ -515,7 +521,7 @@ class HullPulls {
       const Eigen::Vector3d moved = p - aligned.row(v).transpose();
       pulls->push_back({.vertex = {v, v, v},
                         .weight = {1, 0, 0},
-                        .information = share / (sigma_m * sigma_m) * way * way.transpose(),
+                        .information = share / (sigma_m_ * sigma_m_) * way * way.transpose(),
                         .wanted = moved - residual * way});
     }
   }
@@ -525,7 +531,47 @@ class HullPulls {
   const Field& hull_;
   const std::vector<double>& areas_;
   double scale_;
+  double sigma_m_;
 };
+
+/// What a pixel is at a place, in the median of the views that see it; 0 without views.
+double pixel_size(const SilhouetteViews& views, const Eigen::Vector3d& place) {
+  std::vector<double> sizes;
+  for (const auto& view : views) {
+    const double depth = (view->camera().camera_from_world * place).z();
+    if (depth > 0) sizes.push_back(depth * static_cast<double>(view->per_focal()));
+  }
+  return median(std::move(sizes));
+}
+
+/// Where pictures agree on what is near the head, it moves there.
+/// @param coarse  searches far, for a head that may be wrong by some millimetres
+void add_picture_pulls(const NeutralHead& neutral, std::span<const FacePicture> pictures, const Similarity& similarity,
+                       bool coarse, const Positions& displacement, const Mesh& head, const Work& work,
+                       std::vector<Pull>* pulls) {
+  Eigen::Isometry3d world_from_head = Eigen::Isometry3d::Identity();
+  world_from_head.linear() = similarity.rotation;
+  world_from_head.translation() = similarity.translation;
+  constexpr SurfaceMatchOptions far{
+      .spacing_m = 0.002, .half_window_m = 0.010, .range_m = 0.0075, .step_m = 0.00125, .least_correlation = 0.5};
+  constexpr SurfaceMatchOptions near{
+      .spacing_m = 0.0015, .half_window_m = 0.009, .range_m = 0.003, .step_m = 0.00075, .least_correlation = 0.6};
+  const double scale_m = coarse ? 0.006 : 0.003;
+  for (const SurfaceMatch& match : match_surface(pictures, head, world_from_head, coarse ? far : near, work)) {
+    const auto in_face = [&](uint32_t v) { return neutral.face_front[v] != 0; };
+    if (!std::all_of(match.vertex.begin(), match.vertex.end(), in_face)) continue;
+    const Eigen::Vector3d way = match.normal.cast<double>();
+    Eigen::Vector3d moved = Eigen::Vector3d::Zero();
+    for (int k = 0; k < 3; ++k)
+      moved +=
+          static_cast<double>(match.weights[k]) * displacement.row(match.vertex[static_cast<size_t>(k)]).transpose();
+    const double trust = geman_mcclure(match.along_m, scale_m);
+    pulls->push_back({.vertex = match.vertex,
+                      .weight = match.weights.cast<double>(),
+                      .information = trust / (match.sigma_m * match.sigma_m) * way * way.transpose(),
+                      .wanted = moved + match.along_m * way});
+  }
+}
 
 void set_positions(const Positions& positions, Mesh* mesh) {
   for (size_t i = 0; i < mesh->positions.size(); ++i)
@@ -546,9 +592,9 @@ void transform_by_pyramids(const std::vector<Eigen::Vector3d>& from, const std::
 }
 
 /// @return how many places the outlines held
-size_t bend_smoothly(const NeutralHead& neutral, const std::vector<Target>& targets, const SilhouetteViews& views,
-                     const Field& hull, const Similarity& similarity, const HeadFitOptions& options, const Work& work,
-                     Mesh* head) {
+size_t bend_smoothly(const NeutralHead& neutral, const std::vector<Target>& targets,
+                     std::span<const FacePicture> pictures, const SilhouetteViews& views, const Field& hull,
+                     const Similarity& similarity, const HeadFitOptions& options, const Work& work, Mesh* head) {
   const auto count = static_cast<Eigen::Index>(neutral.mesh.positions.size());
   Positions aligned(count, 3);
   for (Eigen::Index i = 0; i < count; ++i) aligned.row(i) = head->positions[static_cast<size_t>(i)].cast<double>();
@@ -569,10 +615,12 @@ size_t bend_smoothly(const NeutralHead& neutral, const std::vector<Target>& targ
 
   DisplacementSolver solver(std::move(energy));
   const OutlinePulls outline_pulls(neutral, areas, similarity.scale);
-  const HullPulls hull_pulls(neutral, hull, areas, similarity.scale);
+  const HullPulls hull_pulls(neutral, hull, areas, similarity.scale, pixel_size(views, similarity.translation));
   Positions displacement = Positions::Zero(count, 3);
   size_t held = 0;
-  const int rounds = views.empty() ? 2 : 3;
+  constexpr int first_with_outlines = 1, last_new_outlines = 2, first_with_pictures = 2, first_near = 4;
+  const int rounds = pictures.size() > 1 ? 5 : views.empty() ? 2 : 3;
+  std::vector<Pull> silhouette_pulls;
   for (int round = 0; round < rounds && !work.stopped(); ++round) {
     std::vector<Pull> pulls;
     for (const Target& target : targets) {
@@ -591,12 +639,17 @@ size_t bend_smoothly(const NeutralHead& neutral, const std::vector<Target>& targ
                        .information = geman_mcclure((wanted - moved).norm(), scale_m) * target.covariance.inverse(),
                        .wanted = wanted});
     }
-    if (round > 0) {
+    if (round >= first_with_outlines && round <= last_new_outlines) {
+      silhouette_pulls.clear();
       const std::vector<Eigen::Vector3f> normals = vertex_normals(*head);
       const std::vector<HeadOutline> outlines = head_outlines(views, *head);
-      held = outline_pulls.add(aligned, *head, outlines, normals, &pulls);
-      if (!outlines.empty()) hull_pulls.add(aligned, *head, own_hull_gaps(outlines, *head, normals), normals, &pulls);
+      held = outline_pulls.add(aligned, *head, outlines, normals, &silhouette_pulls);
+      if (!outlines.empty())
+        hull_pulls.add(aligned, *head, own_hull_gaps(outlines, *head, normals), normals, &silhouette_pulls);
     }
+    pulls.insert(pulls.end(), silhouette_pulls.begin(), silhouette_pulls.end());
+    if (round >= first_with_pictures)
+      add_picture_pulls(neutral, pictures, similarity, round < first_near, displacement, *head, work, &pulls);
     solver.solve(pulls, &displacement);
     set_positions(aligned + displacement, head);
   }
@@ -606,15 +659,17 @@ size_t bend_smoothly(const NeutralHead& neutral, const std::vector<Target>& targ
 }  // namespace
 
 Result<FittedHead> fit_neutral_head(const NeutralHead& neutral, const FaceControlPoints& controls,
-                                    const SilhouetteViews& views, const Field& hull, const HeadFitOptions& options,
-                                    const Work& work) {
+                                    std::span<const FacePicture> pictures, const SilhouetteViews& views,
+                                    const Field& hull, const HeadFitOptions& options, const Work& work) {
   std::vector<Eigen::Vector3d> from;
   for (size_t i = 0; i < landmarks; ++i) from.push_back(neutral.landmark(i, neutral.mesh.positions).cast<double>());
   const std::vector<Eigen::Vector3f> vertex_normal = vertex_normals(neutral.mesh);
   std::vector<Eigen::Vector3d> normals;
   for (size_t i = 0; i < landmarks; ++i)
     normals.emplace_back(neutral.landmark(i, vertex_normal).cast<double>().normalized());
-  std::vector<Target> targets = targets_of(controls, normals);
+  // Sights that touch the jaw meet before it, not on it: where there are outlines, these know better.
+  const bool contours = views.empty() || options.method == HeadFitMethod::pyramids;
+  std::vector<Target> targets = targets_of(controls, normals, contours);
   FittedHead fitted;
   for (const Target& target : targets) fitted.features += is_contour_landmark(target.landmark) ? 0 : 1;
   if (fitted.features < options.fewest_features)
@@ -625,7 +680,7 @@ Result<FittedHead> fit_neutral_head(const NeutralHead& neutral, const FaceContro
   // Which way landmarks face is only known after a first alignment.
   const Similarity rough = align(from, targets);
   for (Eigen::Vector3d& normal : normals) normal = rough.rotation * normal;
-  targets = targets_of(controls, normals);
+  targets = targets_of(controls, normals, contours);
   const Similarity similarity = align(from, targets);
   std::vector<double> deviations;
   for (const Target& target : targets)
@@ -644,11 +699,13 @@ Result<FittedHead> fit_neutral_head(const NeutralHead& neutral, const FaceContro
   fitted.mesh = neutral.mesh;
   fitted.face = neutral.face_front;
   for (Eigen::Vector3f& p : fitted.mesh.positions) p = (similarity * p.cast<double>()).cast<float>();
+  const Mesh aligned = fitted.mesh;
   if (options.method == HeadFitMethod::pyramids)
     transform_by_pyramids(from, complete(neutral, from, similarity, targets), similarity, neutral, &fitted);
   else
-    fitted.outline_points = bend_smoothly(neutral, targets, views, hull, similarity, options, work, &fitted.mesh);
-  const std::vector<float> bare = bareness(neutral, head_outlines(views, fitted.mesh), hull, fitted.mesh);
+    fitted.outline_points =
+        bend_smoothly(neutral, targets, pictures, views, hull, similarity, options, work, &fitted.mesh);
+  const std::vector<float> bare = bareness(neutral, views, aligned, hull, fitted.mesh);
   for (size_t i = 0; i < bare.size(); ++i) fitted.bare.push_back(fitted.face[i] != 0 ? bare[i] : 0);
   if (work.stopped()) return Work::cancelled();
 

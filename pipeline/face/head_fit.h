@@ -2,9 +2,11 @@
 
 #include <Eigen/Core>
 #include <cstdint>
+#include <span>
 #include <vector>
 
 #include "pipeline/face/control_points.h"
+#include "pipeline/face/face_pictures.h"
 #include "pipeline/face/neutral_head.h"
 #include "pipeline/geometry/silhouette_view.h"
 #include "pipeline/types/field.h"
@@ -49,17 +51,20 @@ struct FittedHead {
 /// where that is known, else by the mean of the nearest known deviations.
 ///
 /// Smooth: the displacements of all vertices have the least thin-plate energy, against the control points (weighed by
-/// their covariances and a landmark's own vagueness) and the outlines: where the head's own outline in a view is the
-/// whole head's, it lies on the subject's outline, and no vertex of the face lies outside any. Glasses, beards and hair
-/// give outlines far from where the others want them and lose their say (Geman-McClure).
+/// their covariances and a landmark's own vagueness; the jaw's, where sights touch and do not meet, only where there are
+/// no outlines), the outlines and the pictures. Where the head's own outline in a view is the whole head's, it lies on
+/// the subject's outline, and no vertex of the face lies outside any. Then the pictures are compared on the surface, see
+/// match_surface, and it moves to where they agree, first by centimetre-wide windows, at last by finer ones. Glasses,
+/// beards and hair give outlines far from where the others want them and lose their say (Geman-McClure).
 ///
-/// @param views  outlines of the subject, none allowed
+/// @param pictures  from face_pictures, none allowed
+/// @param views     outlines of the subject, none allowed
 /// @error no_subject  too few control points, or they do not have the shape of a face
-/// Cost: some sparse factorizations of the neutral head's size.
+/// Cost: five sparse factorizations of the neutral head's size, and three comparisons of the pictures.
 /// Source: pyramids: R. Pagés et al., automatic avatar booth, section 4.3. Energy: M. Botsch, O. Sorkine, "On linear
 /// variational surface deformation methods", TVCG 14(1), 2008. Similarity: S. Umeyama, PAMI 13(4), 1991.
 Result<FittedHead> fit_neutral_head(const NeutralHead& neutral, const FaceControlPoints& controls,
-                                    const SilhouetteViews& views, const Field& hull, const HeadFitOptions& options = {},
-                                    const Work& work = {});
+                                    std::span<const FacePicture> pictures, const SilhouetteViews& views,
+                                    const Field& hull, const HeadFitOptions& options = {}, const Work& work = {});
 
 }  // namespace booth

@@ -1,6 +1,7 @@
 #include "pipeline/face/head_view.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 
 #include "pipeline/geometry/camera_model.h"
@@ -16,14 +17,29 @@ float luma(const Image& picture, int x, int y) {
   return red * static_cast<float>(p[0]) + green * static_cast<float>(p[1]) + blue * static_cast<float>(p[2]);
 }
 
-/// Linear between four pixels; 0 outside.
-float sample(const Image& picture, const Eigen::Vector2d& at) {
+/// Red less blue of a colour pixel, linear light.
+float matte(const Image& picture, int x, int y) {
+  static const std::array<float, 256> linear = [] {
+    std::array<float, 256> table{};
+    for (size_t i = 0; i < table.size(); ++i) {
+      const double coded = static_cast<double>(i) / 255;  // IEC 61966-2-1
+      table[i] = static_cast<float>(coded <= 0.04045 ? coded / 12.92 : std::pow((coded + 0.055) / 1.055, 2.4));
+    }
+    return table;
+  }();
+  const uint8_t* p = picture.pixel(x, y);
+  return linear[p[0]] - linear[p[2]];
+}
+
+/// Linear between the values of four pixels; 0 outside.
+template <class Value>
+float sample(const Image& picture, const Eigen::Vector2d& at, Value&& value) {
   if (!(at.x() >= 0 && at.y() >= 0 && at.x() <= picture.width - 1 && at.y() <= picture.height - 1)) return 0;
   const int x = std::min(static_cast<int>(at.x()), picture.width - 2),
             y = std::min(static_cast<int>(at.y()), picture.height - 2);
   const auto fx = static_cast<float>(at.x() - x), fy = static_cast<float>(at.y() - y);
-  return (1 - fy) * ((1 - fx) * luma(picture, x, y) + fx * luma(picture, x + 1, y)) +
-         fy * ((1 - fx) * luma(picture, x, y + 1) + fx * luma(picture, x + 1, y + 1));
+  return (1 - fy) * ((1 - fx) * value(picture, x, y) + fx * value(picture, x + 1, y)) +
+         fy * ((1 - fx) * value(picture, x, y + 1) + fx * value(picture, x + 1, y + 1));
 }
 
 /// From the view's pixels to the camera's, without a world between.
@@ -43,6 +59,28 @@ class ViewToCamera {
   const Intrinsics& view_;
   Eigen::Matrix3d turn_;
 };
+
+/// Samples a value of the picture at every pixel of the view, averaged where the picture is finer.
+template <class Value, class Put>
+void render(const CalibratedView& camera, const Image& picture, const CalibratedView& view, Value&& value, Put&& put) {
+  if (picture.width < 2 || picture.height < 2) return;
+  const ViewToCamera to_camera(camera, view);
+  const auto middle = to_camera(view.intrinsics.cx, view.intrinsics.cy);
+  const auto aside = to_camera(view.intrinsics.cx + 1, view.intrinsics.cy);
+  if (!middle || !aside) return;
+  constexpr int most_samples = 8;
+  const int samples =
+      static_cast<int>(std::clamp(std::ceil((*aside - *middle).norm() - 0.25), 1.0, double{most_samples}));
+  for (int y = 0; y < view.intrinsics.height; ++y)
+    for (int x = 0; x < view.intrinsics.width; ++x) {
+      float sum = 0;
+      for (int i = 0; i < samples * samples; ++i) {
+        const double across = (i % samples + 0.5) / samples - 0.5, down = (i / samples + 0.5) / samples - 0.5;
+        if (const auto at = to_camera(x + across, y + down)) sum += sample(picture, *at, value);
+      }
+      put(x, y, sum / static_cast<float>(samples * samples));
+    }
+}
 
 }  // namespace
 
@@ -67,25 +105,16 @@ std::optional<CalibratedView> upright_view(const CalibratedView& camera, const E
 }
 
 Image render_view(const CalibratedView& camera, const Image& picture, const CalibratedView& view) {
-  const int width = view.intrinsics.width, height = view.intrinsics.height;
-  Image seen(width, height, 1);
-  if (picture.width < 2 || picture.height < 2) return seen;
-  const ViewToCamera to_camera(camera, view);
-  const auto middle = to_camera(view.intrinsics.cx, view.intrinsics.cy);
-  const auto aside = to_camera(view.intrinsics.cx + 1, view.intrinsics.cy);
-  if (!middle || !aside) return seen;
-  constexpr int most_samples = 8;
-  const int samples =
-      static_cast<int>(std::clamp(std::ceil((*aside - *middle).norm() - 0.25), 1.0, double{most_samples}));
-  for (int y = 0; y < height; ++y)
-    for (int x = 0; x < width; ++x) {
-      float sum = 0;
-      for (int i = 0; i < samples * samples; ++i) {
-        const double across = (i % samples + 0.5) / samples - 0.5, down = (i / samples + 0.5) / samples - 0.5;
-        if (const auto at = to_camera(x + across, y + down)) sum += sample(picture, *at);
-      }
-      seen.at(x, y) = static_cast<uint8_t>(std::lround(sum / static_cast<float>(samples * samples)));
-    }
+  Image seen(view.intrinsics.width, view.intrinsics.height, 1);
+  render(camera, picture, view, luma,
+         [&](int x, int y, float value) { seen.at(x, y) = static_cast<uint8_t>(std::lround(value)); });
+  return seen;
+}
+
+FloatImage render_matte(const CalibratedView& camera, const Image& picture, const CalibratedView& view) {
+  FloatImage seen(view.intrinsics.width, view.intrinsics.height, 1);
+  if (picture.channels >= 3)
+    render(camera, picture, view, matte, [&](int x, int y, float value) { seen.at(x, y) = value; });
   return seen;
 }
 

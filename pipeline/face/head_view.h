@@ -25,6 +25,9 @@ std::optional<CalibratedView> upright_view(const CalibratedView& camera, const E
 /// @param view     from upright_view of the same camera
 Image render_view(const CalibratedView& camera, const Image& picture, const CalibratedView& view);
 
+/// The same of red less blue in linear light, −1 … 1; 0 where the picture ends and for a picture of 1 channel.
+FloatImage render_matte(const CalibratedView& camera, const Image& picture, const CalibratedView& view);
+
 /// Where a pixel of the view lies in the camera's picture, distorted pixels.
 std::optional<Eigen::Vector2d> pixel_in_camera(const CalibratedView& camera, const CalibratedView& view,
                                                const Eigen::Vector2d& pixel);

@@ -70,7 +70,7 @@ NeutralHead* HeadFit::neutral_ = nullptr;
 TEST_F(HeadFit, FindsTheSimilarityOfAnUndeformedHead) {
   const auto truth = subject(nothing);
   for (const HeadFitMethod method : {HeadFitMethod::smooth, HeadFitMethod::pyramids}) {
-    const auto fitted = fit_neutral_head(*neutral_, controls_of(truth, 0, 1), {}, Field(), {.method = method});
+    const auto fitted = fit_neutral_head(*neutral_, controls_of(truth, 0, 1), {}, {}, Field(), {.method = method});
     ASSERT_TRUE(fitted.ok()) << fitted.error().message;
     EXPECT_NEAR(fitted->scale, 1.08, 1e-4);
     EXPECT_EQ(fitted->features, 51);
@@ -81,7 +81,7 @@ TEST_F(HeadFit, FindsTheSimilarityOfAnUndeformedHead) {
 TEST_F(HeadFit, PyramidsMeetTheControlPoints) {
   const auto truth = subject(smooth);
   const auto controls = controls_of(truth, 0, 1);
-  const auto fitted = fit_neutral_head(*neutral_, controls, {}, Field(), {.method = HeadFitMethod::pyramids});
+  const auto fitted = fit_neutral_head(*neutral_, controls, {}, {}, Field(), {.method = HeadFitMethod::pyramids});
   ASSERT_TRUE(fitted.ok());
   EXPECT_LT(fitted->feature_median_m, 3e-4);
   EXPECT_GT(share_within(0.004, *fitted, truth), 0.8);
@@ -93,10 +93,11 @@ TEST_F(HeadFit, PyramidsMeetTheControlPoints) {
 
 TEST_F(HeadFit, SmoothFitRecoversAnotherFaceFromItsLandmarks) {
   const auto truth = subject(smooth);
-  const auto fitted = fit_neutral_head(*neutral_, controls_of(truth, 0.0003, 2), {}, Field());
+  const auto fitted = fit_neutral_head(*neutral_, controls_of(truth, 0.0003, 2), {}, {}, Field());
   ASSERT_TRUE(fitted.ok());
   EXPECT_GT(share_within(0.003, *fitted, truth), 0.85);
-  const auto rigid = fit_neutral_head(*neutral_, controls_of(truth, 0.0003, 2), {}, Field(), {.variation_m = 0.0005});
+  const auto rigid =
+      fit_neutral_head(*neutral_, controls_of(truth, 0.0003, 2), {}, {}, Field(), {.variation_m = 0.0005});
   ASSERT_TRUE(rigid.ok());
   EXPECT_GT(share_within(0.002, *fitted, truth), share_within(0.002, *rigid, truth));
 }
@@ -105,7 +106,7 @@ TEST_F(HeadFit, AFewWrongPointsDoLittle) {
   const auto truth = subject(nothing);
   FaceControlPoints controls = controls_of(truth, 0.0005, 3);
   for (const size_t wrong : {36U, 48U, 30U}) controls.points[wrong]->position += Eigen::Vector3d(0.03, 0.02, -0.04);
-  const auto fitted = fit_neutral_head(*neutral_, controls, {}, Field());
+  const auto fitted = fit_neutral_head(*neutral_, controls, {}, {}, Field());
   ASSERT_TRUE(fitted.ok());
   EXPECT_GT(share_within(0.0025, *fitted, truth), 0.97);
 }
@@ -115,7 +116,7 @@ TEST_F(HeadFit, MissingPointsArePredicted) {
   for (const HeadFitMethod method : {HeadFitMethod::smooth, HeadFitMethod::pyramids}) {
     FaceControlPoints controls = controls_of(truth, 0.0003, 4);
     for (size_t i = 0; i < 68; i += 3) controls.points[i].reset();
-    const auto fitted = fit_neutral_head(*neutral_, controls, {}, Field(), {.method = method});
+    const auto fitted = fit_neutral_head(*neutral_, controls, {}, {}, Field(), {.method = method});
     ASSERT_TRUE(fitted.ok());
     EXPECT_GT(share_within(0.005, *fitted, truth), 0.85);
   }
@@ -125,18 +126,18 @@ TEST_F(HeadFit, RefusesTooFewPointsAndShapesThatAreNoFace) {
   const auto truth = subject(nothing);
   FaceControlPoints few = controls_of(truth, 0, 5);
   for (size_t i = 17; i < 60; ++i) few.points[i].reset();
-  const auto refused = fit_neutral_head(*neutral_, few, {}, Field());
+  const auto refused = fit_neutral_head(*neutral_, few, {}, {}, Field());
   ASSERT_FALSE(refused.ok());
   EXPECT_EQ(refused.error().code, ErrorCode::no_subject);
   EXPECT_NE(refused.error().message.find("only 8 landmarks"), std::string::npos) << refused.error().message;
 
   FaceControlPoints scattered = controls_of(truth, 0.05, 6);
-  EXPECT_FALSE(fit_neutral_head(*neutral_, scattered, {}, Field()).ok());
-  EXPECT_FALSE(fit_neutral_head(*neutral_, {}, {}, Field()).ok());
+  EXPECT_FALSE(fit_neutral_head(*neutral_, scattered, {}, {}, Field()).ok());
+  EXPECT_FALSE(fit_neutral_head(*neutral_, {}, {}, {}, Field()).ok());
 
   std::vector<Eigen::Vector3f> tiny = truth;
   for (Eigen::Vector3f& p : tiny) p *= 0.3F;
-  EXPECT_FALSE(fit_neutral_head(*neutral_, controls_of(tiny, 0, 7), {}, Field()).ok());
+  EXPECT_FALSE(fit_neutral_head(*neutral_, controls_of(tiny, 0, 7), {}, {}, Field()).ok());
 }
 
 }  // namespace
