@@ -233,14 +233,15 @@ std::vector<float> weigh_views(const Mesh& mesh, std::span<const PreparedView> v
 }
 
 TexelColours blend_texels(const Mesh& mesh, const Packing& packing, int size, std::span<const PreparedView> views,
-                          const CameraRatings& ratings, std::span<const float> weights, const Work& work) {
+                          const CameraRatings& ratings, std::span<const float> weights,
+                          std::span<const Eigen::Vector2f> shifts, const Work& work) {
   const float usual = usual_rating(ratings);
   const VertexBands bands = make_bands(mesh, views, weights, work);
   const std::vector<Eigen::Array3f> around = colours_around(mesh, bands.low, weights, views.size());
   return paint_texels(
       packing, size,
       [&](size_t t) -> TrianglePainter {
-        const auto seen = views_of_triangle(mesh, packing, t, views, ratings, usual);
+        const auto seen = views_of_triangle(mesh, packing, t, views, ratings, usual, shifts);
         return DetailPainter(mesh.triangles[t], seen, bands, weights, around, views);
       },
       work);

@@ -23,9 +23,11 @@ std::vector<float> weigh_views(const Mesh& mesh, std::span<const PreparedView> v
 /// from the same points of the surface.
 ///
 /// @param weights  of weigh_views()
+/// @param shifts   of align_views(); empty: none
 /// Source: two bands, P. J. Burt, E. H. Adelson, "A multiresolution spline with application to image mosaics", ACM TOG
 /// 2(4), 1983; here the low band lives on the surface's vertices.
 TexelColours blend_texels(const Mesh& mesh, const Packing& packing, int size, std::span<const PreparedView> views,
-                          const CameraRatings& ratings, std::span<const float> weights, const Work& work = {});
+                          const CameraRatings& ratings, std::span<const float> weights,
+                          std::span<const Eigen::Vector2f> shifts, const Work& work = {});
 
 }  // namespace booth

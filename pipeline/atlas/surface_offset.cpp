@@ -8,6 +8,7 @@
 #include <optional>
 #include <utility>
 
+#include "pipeline/atlas/grey_image.h"
 #include "pipeline/atlas/vertex_neighbours.h"
 #include "pipeline/geometry/camera_model.h"
 
@@ -26,18 +27,6 @@ using Patch = Eigen::Array<float, patch_samples, 1>;
 using Scores = Eigen::Array<float, offsets, 1>;
 
 constexpr size_t most_cameras = 4;
-
-/// Grey values about as the eye sees them, 0 … 255, so that noise is alike in light and shade.
-FloatImage grey_image(const LightImage& light) {
-  FloatImage grey(light.width, light.height, 1);
-  for (size_t i = 0; i < grey.samples.size(); ++i) {
-    const int16_t* p = light.samples.data() + 4 * i;
-    const float luma =
-        0.25F * static_cast<float>(p[0]) + 0.5F * static_cast<float>(p[1]) + 0.25F * static_cast<float>(p[2]);
-    grey.samples[i] = 255 * std::sqrt(luma / full_light);
-  }
-  return grey;
-}
 
 /// Bilinear, at a pixel of the image itself; its border goes on.
 float sample_grey(const FloatImage& image, float x, float y) {
@@ -128,7 +117,7 @@ class Correlator {
     PatchView patch;
     patch.grey = &greys_[c][level - finest_level];
     if (patch.grey->width < 2 || patch.grey->height < 2) return {};
-    patch.origin = ((view.projected[v].head<2>().array() + 0.5F) * scale - 0.5F).matrix();
+    patch.origin = on_level(view.projected[v].head<2>(), scale);
     std::array<Eigen::Vector2f, 3> steps_px;
     for (size_t k = 0; k < 3; ++k) {
       const auto pixel = project(*view.camera, (mesh_.positions[v] + pitch_m_ * axes[k]).cast<double>());

@@ -14,6 +14,7 @@
 #include "pipeline/atlas/push_pull.h"
 #include "pipeline/atlas/reference_texturing.h"
 #include "pipeline/atlas/surface_offset.h"
+#include "pipeline/atlas/view_alignment.h"
 
 namespace booth {
 namespace {
@@ -135,7 +136,10 @@ TexelColours paint(const Mesh& mesh, const Packing& packing, std::span<const Pre
     case TextureMethod::blend: return paint_rating_means(mesh, packing, options.size, views, ratings, occluder, work);
     case TextureMethod::full: break;
   }
-  return blend_texels(mesh, packing, options.size, views, ratings, weigh_views(mesh, views, ratings), work);
+  const std::vector<float> weights = weigh_views(mesh, views, ratings);
+  std::vector<Eigen::Vector2f> shifts;
+  if (options.align_views) shifts = align_views(mesh, views, ratings, weights, work);
+  return blend_texels(mesh, packing, options.size, views, ratings, weights, shifts, work);
 }
 
 constexpr std::array<std::pair<TextureMethod, std::string_view>, 3> method_names{

@@ -38,6 +38,7 @@ struct AtlasOptions {
   TextureMethod method = TextureMethod::full;
   bool balance_colours = true;  ///< of `full`: removes differences of gain and white balance between cameras
   bool align_surface = true;    ///< of `full`: moves vertices to where the cameras agree on what is there
+  bool align_views = true;      ///< of `full`: lays pictures over each other where they still disagree
 };
 
 struct TextureAtlas {

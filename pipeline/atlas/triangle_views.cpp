@@ -46,7 +46,7 @@ float most(const TriangleView& view) { return *std::max_element(view.rating.begi
 
 std::vector<TriangleView> views_of_triangle(const Mesh& mesh, const Packing& packing, size_t t,
                                             std::span<const PreparedView> views, const CameraRatings& ratings,
-                                            float usual) {
+                                            float usual, std::span<const Eigen::Vector2f> shifts) {
   const auto& triangle = mesh.triangles[t];
   const float density = texels_per_m2(mesh, packing, t);
   std::vector<TriangleView> seen;
@@ -62,6 +62,10 @@ std::vector<TriangleView> views_of_triangle(const Mesh& mesh, const Packing& pac
       view.depth[k] = p.z();
       view.x_depth[k] = p.x() * p.z();
       view.y_depth[k] = p.y() * p.z();
+      if (!shifts.empty()) {
+        view.x_shift[k] = shifts[triangle[k] * views.size() + c].x();
+        view.y_shift[k] = shifts[triangle[k] * views.size() + c].y();
+      }
       sum += view.rating[k];
     }
     if (!usable || !(sum > 0)) continue;

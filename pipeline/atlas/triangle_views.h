@@ -1,5 +1,6 @@
 #pragma once
 
+#include <Eigen/Core>
 #include <array>
 #include <span>
 #include <vector>
@@ -16,7 +17,8 @@ struct TriangleView {
   size_t view = 0;
   std::array<float, 3> rating{};  ///< at the corners, as a share of the usual one
   std::array<float, 3> depth{}, x_depth{}, y_depth{};
-  float lod = 0;         ///< log2 of the pixels under a texel's edge
+  std::array<float, 3> x_shift{}, y_shift{};  ///< of align_views()
+  float lod = 0;                              ///< log2 of the pixels under a texel's edge
   bool certain = false;  ///< all of the triangle and its surroundings is visible, far from any outline or depth step
 
   /// Of each of the first `count` places, given by the weights of the corners: the rating, 0 where it would be below;
@@ -33,8 +35,8 @@ struct TriangleView {
       const float rating_here = interpolated(rating, i);
       (*rating_at)[i] = rating_here > 0 ? rating_here : 0;
       (*z)[i] = interpolated(depth, i);
-      (*x)[i] = interpolated(x_depth, i) / (*z)[i];
-      (*y)[i] = interpolated(y_depth, i) / (*z)[i];
+      (*x)[i] = interpolated(x_depth, i) / (*z)[i] + interpolated(x_shift, i);
+      (*y)[i] = interpolated(y_depth, i) / (*z)[i] + interpolated(y_shift, i);
     }
   }
 };
@@ -42,10 +44,11 @@ struct TriangleView {
 /// The cameras that see at least one corner of the triangle, best first where there are more than sixteen: the others
 /// are left out, they add nothing.
 ///
-/// @param usual  rating that counts as 1
+/// @param usual   rating that counts as 1
+/// @param shifts  of align_views(); empty: none
 std::vector<TriangleView> views_of_triangle(const Mesh& mesh, const Packing& packing, size_t triangle,
                                             std::span<const PreparedView> views, const CameraRatings& ratings,
-                                            float usual);
+                                            float usual, std::span<const Eigen::Vector2f> shifts = {});
 
 constexpr size_t most_views_of_triangle = 16;
 

@@ -419,26 +419,57 @@ TEST(TextureAtlas, WhatStandsInFrontDoesNotPrintOnWhatIsBehind) {
   EXPECT_LT(static_cast<double>(wrong), 0.005 * static_cast<double>(all));
 }
 
-// Stripes of many widths on a ball that is 6 mm smaller than its mesh: the cameras tell where the surface is.
-TEST(TextureAtlas, LaysTheSurfaceWhereTheCamerasAgreeButNotWhereItIsKnown) {
-  constexpr double radius_m = 0.4, too_large_m = 0.006;
-  const Paint paint = [](const Eigen::Vector3d& p) {
+/// A ball with stripes of many widths, and a mesh that is larger than it.
+struct StripedBall {
+  static constexpr double radius_m = 0.4;
+  Scene scene;
+  Eigen::Vector3d middle = Eigen::Vector3d::Zero();
+
+  static Eigen::Vector3d paint(const Eigen::Vector3d& p) {
     const double wave = std::sin(70 * p.y() + 9 * std::sin(21 * p.x())) + std::sin(60 * p.x() + 50 * p.z());
     return Eigen::Vector3d::Constant(0.5 + 0.2 * wave);
+  }
+  explicit StripedBall(double too_large_m)
+      : scene(photographed(synthetic::sphere(radius_m), paint, 0.03, {.cameras = 10, .width = 240, .height = 320})) {
+    for (const Eigen::Vector3f& p : scene.mesh.positions) middle += p.cast<double>();
+    middle /= static_cast<double>(scene.mesh.positions.size());
+    for (Eigen::Vector3f& p : scene.mesh.positions)
+      p = (middle + (radius_m + too_large_m) * (p.cast<double>() - middle).normalized()).cast<float>();
+  }
+  bool seen_from_all_around(const Eigen::Vector3d& p) const { return std::abs(p.y() - middle.y()) < 0.6 * radius_m; }
+};
+
+// Averaged where they do not meet, the stripes would lose their contrast; one over the other they keep it.
+TEST(TextureAtlas, LaysThePicturesOverEachOtherWhereTheSurfaceIsWrong) {
+  const StripedBall ball(0.010);
+  const auto contrast = [&](bool align) {
+    AtlasOptions options = small;
+    options.align_surface = false;
+    options.align_views = align;
+    double sum = 0, squares = 0, count = 0;
+    for (const Sample& s : middles(ball.scene.mesh, textured(ball.scene, options).atlas)) {
+      if (!ball.seen_from_all_around(s.position)) continue;
+      sum += s.colour.mean();
+      squares += s.colour.mean() * s.colour.mean();
+      ++count;
+    }
+    return std::sqrt(squares / count - sum * sum / count / count);
   };
-  Scene scene = photographed(synthetic::sphere(radius_m), paint, 0.03, {.cameras = 10, .width = 240, .height = 320});
-  const Eigen::Vector3d middle = [&] {
-    Eigen::Vector3d sum = Eigen::Vector3d::Zero();
-    for (const Eigen::Vector3f& p : scene.mesh.positions) sum += p.cast<double>();
-    return Eigen::Vector3d(sum / static_cast<double>(scene.mesh.positions.size()));
-  }();
-  for (Eigen::Vector3f& p : scene.mesh.positions)
-    p = (middle + (radius_m + too_large_m) * (p.cast<double>() - middle).normalized()).cast<float>();
+  const double without = contrast(false), with = contrast(true), whole = 0.2 * 255;
+  EXPECT_LT(without, 0.93 * whole) << "nothing to be cured";
+  EXPECT_GT(with, without + 0.6 * (whole - without));
+}
+
+// The cameras tell where the surface of a ball is that is 6 mm smaller than its mesh.
+TEST(TextureAtlas, LaysTheSurfaceWhereTheCamerasAgreeButNotWhereItIsKnown) {
+  constexpr double too_large_m = 0.006, radius_m = StripedBall::radius_m;
+  const StripedBall ball(too_large_m);
+  const Scene& scene = ball.scene;
   const auto mean_distance = [&](const std::vector<Eigen::Vector3f>& positions) {
     double sum = 0, count = 0;
     for (const Eigen::Vector3f& p : positions) {
-      if (std::abs(static_cast<double>(p.y()) - middle.y()) > 0.6 * radius_m) continue;  // seen from all around
-      sum += std::abs((p.cast<double>() - middle).norm() - radius_m);
+      if (!ball.seen_from_all_around(p.cast<double>())) continue;
+      sum += std::abs((p.cast<double>() - ball.middle).norm() - radius_m);
       ++count;
     }
     return sum / count;
