@@ -215,6 +215,67 @@ void limit_slope(const Mesh& mesh, const Adjacency& adjacency, const std::vector
     if (face[v] != 0) (*moved)[v] = std::min((*moved)[v], steepest * lowest[v]);
 }
 
+/// How much the surface is smoothed where it goes over from the scan to the hull, 0 … 1 per vertex: all of it that was
+/// not measured and hangs together with the hull around (holes in the face do not), fading over the scan's rim, where
+/// grazing sight leaves lace.
+/// @param measured  1 where a vertex met the scan
+/// @param face      1 where it moved
+std::vector<float> seam_weights(const Mesh& mesh, const Adjacency& adjacency, const std::vector<uint8_t>& measured,
+                                const std::vector<uint8_t>& face) {
+  constexpr float rim_m = 0.006F;
+  std::vector<float> across(mesh.positions.size(), infinite);  // length over the scan on the way from the hull
+  std::priority_queue<PathEnd, std::vector<PathEnd>, std::greater<>> queue;
+  for (uint32_t v = 0; v < face.size(); ++v)
+    if (face[v] == 0) {
+      across[v] = 0;
+      queue.emplace(0.0F, v);
+    }
+  while (!queue.empty()) {
+    const auto [so_far, v] = queue.top();
+    queue.pop();
+    if (so_far > across[v]) continue;
+    for (const uint32_t n : adjacency.of(v)) {
+      const float there = so_far + (measured[n] != 0 ? (mesh.positions[n] - mesh.positions[v]).norm() : 0.0F);
+      if (there > rim_m || there >= across[n]) continue;
+      across[n] = there;
+      queue.emplace(there, n);
+    }
+  }
+  std::vector<float> weight(across.size(), 0);
+  for (size_t v = 0; v < weight.size(); ++v)
+    if (face[v] != 0 && across[v] < infinite) weight[v] = 1 - across[v] / rim_m;
+  return weight;
+}
+
+/// Smooths without shrinking where weights say so.
+/// Source: G. Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995.
+void smooth_seam(const Adjacency& adjacency, const std::vector<float>& weight, const Work& work, Mesh* mesh) {
+  constexpr int rounds = 60;  // smooths away waves of up to a centimetre where edges are a millimetre long
+  constexpr float inwards = 0.5F, outwards = -0.52F;
+  std::vector<uint32_t> seam;
+  for (uint32_t v = 0; v < weight.size(); ++v)
+    if (weight[v] > 0) seam.push_back(v);
+  std::vector<Eigen::Vector3f> moved(seam.size());
+  for (int step = 0; step < 2 * rounds && !work.stopped(); ++step) {
+    const float factor = step % 2 == 0 ? inwards : outwards;
+    work.parallel_for(seam.size(), vertex_grain, [&](size_t begin, size_t end) {
+      for (size_t i = begin; i < end; ++i) {
+        const Eigen::Vector3f& p = mesh->positions[seam[i]];
+        Eigen::Vector3f sum = Eigen::Vector3f::Zero();
+        float weights = 0;
+        for (const uint32_t n : adjacency.of(seam[i])) {
+          constexpr float least_m = 1e-5F;
+          const float w = 1 / std::max((mesh->positions[n] - p).norm(), least_m);
+          sum += w * (mesh->positions[n] - p);
+          weights += w;
+        }
+        moved[i] = weights > 0 ? Eigen::Vector3f(p + factor * weight[seam[i]] / weights * sum) : p;
+      }
+    });
+    for (size_t i = 0; i < seam.size(); ++i) mesh->positions[seam[i]] = moved[i];
+  }
+}
+
 template <class Predicate>
 double area_where(const Mesh& mesh, const Predicate& of_vertex) {
   double area = 0;
@@ -250,6 +311,9 @@ Result<FaceMerge> merge_by_sight(const Mesh& hull, const HeadRegion& head, const
   for (size_t v = 0; v < free.size(); ++v)
     if (!std::isnan(d.moved[v])) d.mesh.positions[v] += d.moved[v] * rays.direction(d.mesh.positions[v]);
   out.moved_m2 = area_where(d.mesh, [&](uint32_t v) { return away[v] == 0; });
+  std::vector<uint8_t> measured(free.size());
+  for (size_t v = 0; v < free.size(); ++v) measured[v] = away[v] == 0 ? 1 : 0;
+  smooth_seam(adjacency, seam_weights(d.mesh, adjacency, measured, out.face), work, &d.mesh);
   out.mesh = std::move(d.mesh);
   return out;
 }

@@ -37,7 +37,8 @@ struct FaceMerge {
 /// By sight: everything that a scanner measures it sees, so from its eye the scan is met once by every ray, nostrils
 /// and the underside of nose and chin included, and the part of the hull that faces the eye is, too. Vertices go along
 /// these rays, none past another, so nothing folds. How far the surface beside the scan (and in holes of it) goes
-/// continues the scan's displacement smoothly (least bending) and fades within the bridge.
+/// continues the scan's displacement smoothly (least bending) and fades within the bridge. Where scan and hull meet,
+/// the surface is then smoothed without shrinking, by which the scan's outermost 6 mm lose their lace.
 ///
 /// Radial: vertices of the subdivided region (by the butterfly scheme) go along the rays from the head's barycentre to
 /// the outermost surface there. Between the MOVED and the STUCK shore, half a bridge to each side of where the scan
@@ -49,7 +50,8 @@ struct FaceMerge {
 /// @param eye   world frame: where the scan was seen from (the projector)
 /// @error no_subject  the scan does not meet the head
 /// Source: displacement with least bending: M. Botsch, O. Sorkine, "On linear variational surface deformation methods",
-/// TVCG 14(1), 2008. Radial: R. Pagés et al., automatic avatar booth, section 4.2.
+/// TVCG 14(1), 2008; smoothing: G. Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995.
+/// Radial: R. Pagés et al., automatic avatar booth, section 4.2.
 Result<FaceMerge> merge_face(const Mesh& hull, const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye,
                              const FaceMergeOptions& options = {}, const Work& work = {});
 

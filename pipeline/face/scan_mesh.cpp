@@ -66,6 +66,39 @@ void average_noise(const RangeScan& scan, const ScanMeshOptions& options, const 
   });
 }
 
+/// Drops what is narrower than a square of points, such as the lace that grazing light leaves at the sides of a head: a
+/// point stays where it lies in a square that is measured but for a few points (an opening of the grid).
+void drop_narrow(int side, RangeScan* scan) {
+  const int width = scan->width, height = scan->height;
+  if (side < 2 || width < side || height < side) return;
+  // Sums over the rectangle before each point.
+  const auto at = [&](int x, int y) {
+    return static_cast<size_t>(y) * static_cast<size_t>(width + 1) + static_cast<size_t>(x);
+  };
+  const size_t size = static_cast<size_t>(width + 1) * static_cast<size_t>(height + 1);
+  const auto sums_of = [&](const auto& value) {
+    std::vector<int> sums(size, 0);
+    for (int y = 0; y < height; ++y)
+      for (int x = 0; x < width; ++x)
+        sums[at(x + 1, y + 1)] = value(x, y) + sums[at(x, y + 1)] + sums[at(x + 1, y)] - sums[at(x, y)];
+    return sums;
+  };
+  const auto in_square = [&](const std::vector<int>& sums, int x, int y) {
+    const int x0 = std::max(x, 0), y0 = std::max(y, 0), x1 = std::min(x + side, width), y1 = std::min(y + side, height);
+    return sums[at(x1, y1)] - sums[at(x0, y1)] - sums[at(x1, y0)] + sums[at(x0, y0)];
+  };
+  const std::vector<int> measured = sums_of([&](int x, int y) { return scan->measured(scan->index(x, y)) ? 1 : 0; });
+  constexpr double least_share = 0.95;
+  const int least = static_cast<int>(std::ceil(least_share * side * side));
+  const std::vector<int> full = sums_of([&](int x, int y) {
+    return x + side <= width && y + side <= height && in_square(measured, x, y) >= least ? 1 : 0;
+  });
+  for (int y = 0; y < height; ++y)
+    for (int x = 0; x < width; ++x)
+      if (in_square(full, x - side + 1, y - side + 1) == 0)
+        scan->points[scan->index(x, y)].setConstant(std::numeric_limits<float>::quiet_NaN());
+}
+
 /// Joins the two sides of narrow gaps in the grid's rows and columns, as they lie between a near surface and a far one.
 /// Points that it adds have an infinite sigma.
 void close_gaps(RangeScan* scan) {
@@ -240,6 +273,7 @@ Result<ScanMesh> mesh_scan(const RangeScan& scan, const ScanMeshOptions& options
   else
     smooth = scan;
   if (work.stopped()) return Work::cancelled();
+  drop_narrow(options.narrowest, &smooth);
   close_gaps(&smooth);
   close_holes(options.largest_hole_m, &smooth);
   std::vector<uint32_t> source;

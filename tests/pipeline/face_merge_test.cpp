@@ -115,6 +115,29 @@ TEST(FuseScan, FillsWhereASilhouetteCutTooDeep) {
   EXPECT_LT(worst_on_face(mesh), 0.004);
 }
 
+TEST(MeshScan, DropsWhatIsNarrow) {
+  // A square of points a millimetre apart, with a strip of three points' width at its side.
+  constexpr int side = 40, reach = 20, strip = 3;
+  RangeScan scan(side + reach, side);
+  for (int y = 0; y < side; ++y)
+    for (int x = 0; x < side + reach; ++x) {
+      if (x >= side && (y < side / 2 || y >= side / 2 + strip)) continue;
+      scan.points[scan.index(x, y)] = {0.001F * static_cast<float>(x), 0.001F * static_cast<float>(y), 0};
+      scan.sigma_m[scan.index(x, y)] = 1e-4F;
+    }
+  const auto farthest = [](const ScanMesh& mesh) {
+    float most = 0;
+    for (const auto& t : mesh.mesh.triangles)
+      for (const uint32_t v : t) most = std::max(most, mesh.mesh.positions[v].x());
+    return most;
+  };
+  const auto dropped = mesh_scan(scan, {.smoothing_radius = 0}),
+             kept = mesh_scan(scan, {.narrowest = 0, .smoothing_radius = 0});
+  ASSERT_TRUE(dropped.ok() && kept.ok());
+  EXPECT_NEAR(farthest(*dropped), 0.039, 0.0015);
+  EXPECT_NEAR(farthest(*kept), 0.059, 0.0005);
+}
+
 TEST(MergeFace, FollowsTheScanAndStaysClosed) {
   const auto merged = merge_face(fused(), scene().head, scene().scan, scene().eye);
   ASSERT_TRUE(merged.ok()) << merged.error().message;
