@@ -254,13 +254,6 @@ void CaptureSession::end_operation(bool failed) {
   parts_.set_state(BoothState::idle);
 }
 
-Result<void> CaptureSession::acknowledge(const Operation& operation) const {
-  const auto noted = parts_.journal.sync(operation.id);
-  if (operation.acknowledge)
-    operation.acknowledge(noted ? Result<std::string>(operation.id) : Result<std::string>(noted.error()));
-  return noted;
-}
-
 bool CaptureSession::is_draining() const {
   const std::lock_guard lock(mutex_);
   return draining_;
@@ -275,10 +268,18 @@ void CaptureSession::carry_out(const Operation& operation, const CaptureRequest&
   const std::string& id = operation.id;
   spdlog::info("capture {}: started", id);
   const Timestamp started = parts_.clock.now();
+  bool acknowledged = false;
+  const auto acknowledge = [&](const Result<std::string>& begun) {
+    if (operation.acknowledge) operation.acknowledge(begun);
+    acknowledged = true;
+  };
   Result<void> taken;
   try {
-    taken = acknowledge(operation);
-    if (taken) taken = take(id, request, operation.stop.get_token());
+    taken = parts_.journal.sync(id);
+    if (taken) {
+      acknowledge(id);
+      taken = take(id, request, operation.stop.get_token());
+    }
   } catch (const std::exception& fault) {
     taken = Error{ErrorCode::internal, "the booth's program has a fault: " + std::string(fault.what())};
   }
@@ -290,6 +291,10 @@ void CaptureSession::carry_out(const Operation& operation, const CaptureRequest&
     parts_.metrics.add("captures_failed");
     spdlog::warn("capture {}: failed: {}: {}", id, to_string(taken.error().code), taken.error().message);
     parts_.events.publish(CaptureFailed{id, taken.error()});
+    if (!acknowledged) {
+      end_journal(id);
+      return acknowledge(taken.error());
+    }
     // Who no longer hears that, because the booth stops or is killed now, is told after the next start.
     if (!is_draining()) announced_.push_back(id);
     return;

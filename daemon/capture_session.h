@@ -150,7 +150,6 @@ class CaptureSession {
   void carry_out(const Operation& operation, const CaptureRequest& request);
   template <class TaskRequest>
   void carry_out(const Operation& operation, const TaskRequest& request);
-  Result<void> acknowledge(const Operation& operation) const;
   bool is_draining() const;
   void end_announced();
   void end_journal(const std::string& id) const;
