@@ -4,6 +4,7 @@
 #include <deque>
 #include <filesystem>
 #include <memory>
+#include <mutex>
 #include <nlohmann/json_fwd.hpp>
 #include <optional>
 #include <string>
@@ -15,7 +16,7 @@
 namespace booth::api {
 
 /// The answers that were given to requests with a `key`, kept for a day, across restarts: a request repeated gets the
-/// same answer and changes nothing. Of a request's parameters only a digest is kept. One thread at a time.
+/// same answer and changes nothing. Of a request's parameters only a digest is kept. Any thread.
 class KeyStore {
  public:
   using Clock = std::chrono::system_clock;
@@ -34,20 +35,27 @@ class KeyStore {
   void remember(const std::string& key, const std::string& method, const nlohmann::json& params,
                 const std::string& result, Clock::time_point now);
 
-  /// Waits for the disk; any thread, until the store is destroyed.
-  void sync() const;
+  /// Waits for the disk. A journal of which most has ended is written anew, without holding up the others meanwhile.
+  void sync();
 
  private:
   struct Entry {
     std::string digest, result;
     Clock::time_point until;
   };
-  KeyStore() = default;
+  explicit KeyStore(std::filesystem::path journal) : file_(std::move(journal)) {}
   void expire(Clock::time_point now);
+  void append(const std::string& line);
+  void compact();
 
-  int journal_ = -1;
-  std::unordered_map<std::string, Entry> entries_;
-  std::deque<std::pair<Clock::time_point, std::string>> order_;  ///< keys by the time they end
+  const std::filesystem::path file_;
+  std::mutex disk_mutex_;  ///< held while the disk is waited for; before mutex_
+  std::mutex mutex_;
+  int journal_ = -1;                                             ///< guarded by mutex_, and changes under both
+  std::unordered_map<std::string, Entry> entries_;               ///< guarded by mutex_
+  std::deque<std::pair<Clock::time_point, std::string>> order_;  ///< guarded by mutex_; keys by the time they end
+  size_t lines_ = 0;                                             ///< guarded by mutex_; of the journal
+  std::optional<std::string> appended_;                          ///< guarded by mutex_; lines since compact() began
 };
 
 }  // namespace booth::api
