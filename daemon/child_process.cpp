@@ -1,6 +1,7 @@
 #include "daemon/child_process.h"
 
 #include <fcntl.h>
+#include <sched.h>
 #include <signal.h>
 #include <sys/prctl.h>
 #include <sys/resource.h>
@@ -21,7 +22,7 @@ namespace {
 constexpr int progress_number = 3;  ///< the descriptor on which the child reports
 /// The kernel takes the child before the daemon when memory runs out.
 constexpr std::string_view out_of_memory_score = "500";
-constexpr int niceness = 5;  ///< a capture goes before
+constexpr int niceness = 10;  ///< captures and answers go before
 
 struct Pipe {
   int read = -1, write = -1;
@@ -51,7 +52,11 @@ void write_errno(int descriptor) {
   ::prctl(PR_SET_PDEATHSIG, SIGKILL);
   if (::getppid() != parent) ::_exit(exec_failed);  // the daemon died before the line above
 
+  // Nor does it take the processor from the daemon when that wakes up. Where either is refused, the job runs all the
+  // same.
   ::setpriority(PRIO_PROCESS, 0, niceness);
+  const sched_param batch{};
+  ::sched_setscheduler(0, SCHED_BATCH, &batch);
 
   sigset_t none;
   sigemptyset(&none);
