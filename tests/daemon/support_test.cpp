@@ -1,6 +1,8 @@
 #include <gmock/gmock.h>
+#include <syslog.h>
 
 #include "daemon/identifier.h"
+#include "daemon/log.h"
 #include "daemon/metrics.h"
 #include "daemon/prometheus.h"
 #include "daemon/redaction.h"
@@ -40,6 +42,21 @@ TEST(Redaction, TakesOutEveryIdThatIsMade) {
   EXPECT_EQ(text, "capture capture-1 and /x/capture-2/y, again capture-1");
   EXPECT_EQ(redaction.apply(second), "capture-2") << "the same in another text";
   EXPECT_THAT(capture_ids_in(first + second + first), ElementsAre(first, second));
+}
+
+TEST(JournalFields, NameTheCaptureAndTheJob) {
+  const std::string id = "2026-11-22T10-15-00.123Z-00ff";
+  EXPECT_THAT(journal_fields(LOG_WARNING, "capture " + id + ": failed: timeout: b1 is late"),
+              testing::IsSupersetOf({"MESSAGE=capture " + id + ": failed: timeout: b1 is late",
+                                     std::string("PRIORITY=4"), "BOOTH_CAPTURE=" + id}));
+  EXPECT_THAT(journal_fields(LOG_INFO, "job " + id + ": done"),
+              testing::IsSupersetOf({std::string("PRIORITY=6"), "BOOTH_JOB=" + id, "BOOTH_CAPTURE=" + id}));
+}
+
+TEST(JournalFields, WhatIsNoIdIsNone) {
+  for (const char* text : {"the capture thread: out of memory", "capture ../../etc: failed", "capture", "capture : x",
+                           "job two words: started", "stopping", ""})
+    EXPECT_THAT(journal_fields(LOG_INFO, text), Not(testing::Contains(HasSubstr("BOOTH_")))) << text;
 }
 
 TEST(Redaction, TakesOutLabels) {
