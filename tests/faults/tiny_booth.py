@@ -140,7 +140,7 @@ class Booth:
         self.context = zmq.Context.instance()
         self.process = self.subscriber = self.requester = None
         self.requests = 0
-        self.settings = ""
+        self.settings = self.api = ""  # TOML, the latter of the section [api]
 
     def behave(self, how, seconds):
         (self.folder / "behaviour").write_text(f"{how} {seconds}")
@@ -152,7 +152,7 @@ class Booth:
         """Starts the process, waiting for nothing."""
         config = self.folder / "boothd.toml"
         config.write_text(
-            f'[booth]\nstate_directory = "{self.state}"\n[api]\ncontrol = "{self.control}"\nevents = "{self.events}"\n'
+            f'[booth]\nstate_directory = "{self.state}"\n[api]\ncontrol = "{self.control}"\nevents = "{self.events}"\n{self.api}'
             f'[capture]\nframe_timeout_ms = 1000\n[disk]\nreserve_mib = 0\n'
             f'[replay]\nrecording = "{self.recording}"\npace = "fast"\n{self.settings}')
         command = [self.bin_dir / "boothd", "--config", config]
