@@ -374,7 +374,7 @@ Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOp
 
   {
     const StageReport report("refine", work, progress);
-    hull.field = refine_shape(std::move(hull.field), hull.views, options.refinement, report.work());
+    hull.field = refine_shape(std::move(hull.field), hull.views, frames, options.refinement, report.work());
     if (work.stopped()) return Work::cancelled();
   }
 

@@ -9,6 +9,7 @@
 
 #include "pipeline/geometry/solid_parts.h"
 #include "pipeline/refine/hull_samples.h"
+#include "pipeline/refine/photo_consistency.h"
 #include "pipeline/refine/smooth_distance.h"
 
 namespace booth {
@@ -19,6 +20,12 @@ constexpr double cell_m = 0.02;  // of the grid on which the surface is looked f
 /// Around sure hull the smooth surface may be this far inside without effect: it knows no details.
 constexpr float detail_m = 0.03F;
 
+/// What holds the smooth surface, and how strongly.
+struct Evidence {
+  std::vector<HullSample> samples;
+  std::vector<float> weights;  ///< 0 … 1
+};
+
 std::vector<float> weights_of(const std::vector<HullSample>& samples, const ShapeRefinementOptions& options) {
   std::vector<float> weights;
   weights.reserve(samples.size());
@@ -28,6 +35,38 @@ std::vector<float> weights_of(const std::vector<HullSample>& samples, const Shap
     weights.push_back(known * known * known);
   }
   return weights;
+}
+
+/// The hull's evidence, and behind it what photographs show where the hull is doubtful; the hull's guess gives way
+/// there.
+Evidence with_photographs(const Evidence& of_hull, const PhotoConsistency& photographs, const SmoothDistance& guess,
+                          double inwards_m, const ShapeRefinementOptions& options, const Work& work) {
+  std::vector<HullSample> doubtful;
+  std::vector<size_t> numbers;
+  for (size_t s = 0; s < of_hull.samples.size(); ++s)
+    if (of_hull.samples[s].slack_m > static_cast<float>(options.doubtful_m)) {
+      doubtful.push_back(of_hull.samples[s]);
+      numbers.push_back(s);
+    }
+  const auto seen = photographs.find(guess, doubtful, inwards_m, work);
+  Evidence all = of_hull;
+  for (size_t n = 0; n < seen.size(); ++n) {
+    if (!seen[n]) continue;
+    all.weights[numbers[n]] *= 1 - seen[n]->confidence;
+    all.samples.push_back({.position = seen[n]->position, .normal = seen[n]->normal});
+    all.weights.push_back(seen[n]->confidence);
+  }
+  return all;
+}
+
+/// Believes samples less the farther they lie from the surface that all together make, from the one numbered `first`
+/// on. After S. Geman, D. McClure, "Statistical methods for tomographic image reconstruction", 1987.
+void doubt_stray(Evidence& evidence, size_t first, const SmoothDistance& surface) {
+  constexpr float usual_m = 0.004F;
+  for (size_t s = first; s < evidence.samples.size(); ++s) {
+    const float off = surface.at(evidence.samples[s].position) / usual_m;
+    evidence.weights[s] /= (1 + off * off) * (1 + off * off);
+  }
 }
 
 /// Takes away from the hull what lies outside the smooth surface.
@@ -93,28 +132,43 @@ Field carve(Field hull, const SmoothDistance& smooth, const std::vector<float>& 
 
 }  // namespace
 
-Field refine_shape(Field hull, const SilhouetteViews& views, const ShapeRefinementOptions& options, const Work& work) {
+Field refine_shape(Field hull, const SilhouetteViews& views, std::span<const Frame> frames,
+                   const ShapeRefinementOptions& options, const Work& work) {
   if (!options.enabled) return hull;
-  std::vector<HullSample> samples = sample_hull(hull, cell_m);
-  if (samples.empty()) return hull;
-  measure_slack(hull, views, samples, work);
-  std::vector<float> weights = weights_of(samples, options);
+  Evidence evidence{sample_hull(hull, cell_m), {}};
+  if (evidence.samples.empty()) return hull;
+  measure_slack(hull, views, evidence.samples, work);
+  evidence.weights = weights_of(evidence.samples, options);
 
   constexpr int coarsest_iterations = 100, iterations = 16;
-  SmoothDistance coarse(hull, samples, {4 * cell_m, options.stiffness, coarsest_iterations});
-  SmoothDistance middle(hull, samples, {2 * cell_m, options.stiffness, iterations});
-  SmoothDistance fine(hull, samples, {cell_m, options.stiffness, iterations});
+  SmoothDistance coarse(hull, evidence.samples, {4 * cell_m, options.stiffness, coarsest_iterations});
+  SmoothDistance middle(hull, evidence.samples, {2 * cell_m, options.stiffness, iterations});
+  SmoothDistance fine(hull, evidence.samples, {cell_m, options.stiffness, iterations});
 
   std::vector<float> spared;
-  for (const HullSample& sample : samples) {
+  for (const HullSample& sample : evidence.samples) {
     const float open = sample.slack_m / static_cast<float>(options.sure_m) - 1;
     const float sure = std::clamp(1 - open, 0.0F, 1.0F);
     spared.push_back(detail_m * sure * sure);
   }
   const std::vector<float> spared_m = fine.spread(spared);
-  coarse.solve(weights, nullptr, work);
-  middle.solve(weights, &coarse, work);
-  fine.solve(weights, &middle, work);
+  coarse.solve(evidence.samples, evidence.weights, nullptr, work);
+  middle.solve(evidence.samples, evidence.weights, &coarse, work);
+  fine.solve(evidence.samples, evidence.weights, &middle, work);
+  if (options.photographs && !work.stopped()) {
+    const PhotoConsistency photographs(frames, views, hull, work);
+    const auto solve = [&](const Evidence& all) {
+      middle.solve(all.samples, all.weights, nullptr, work);
+      fine.solve(all.samples, all.weights, &middle, work);
+    };
+    constexpr double first_inwards_m = 0.03, then_inwards_m = 0.015;
+    solve(with_photographs(evidence, photographs, fine, first_inwards_m, options, work));
+    // Now it is known better where to look, and how the surface is turned there.
+    Evidence all = with_photographs(evidence, photographs, fine, then_inwards_m, options, work);
+    solve(all);
+    doubt_stray(all, evidence.samples.size(), fine);
+    solve(all);
+  }
   if (work.stopped()) return hull;
   Field refined = carve(std::move(hull), fine, spared_m, work);
   keep_largest_part(refined, work);

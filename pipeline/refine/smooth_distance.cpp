@@ -39,20 +39,18 @@ double dot(const std::vector<float>& a, const std::vector<float>& b) {
 
 SmoothDistance::SmoothDistance(const Field& hull, std::span<const HullSample> samples,
                                const SmoothDistanceOptions& options)
-    : samples_(samples),
-      origin_(hull.grid().origin.cast<float>()),
+    : origin_(hull.grid().origin.cast<float>()),
       cell_m_(static_cast<float>(options.cell_m)),
       stiffness_(static_cast<float>(options.stiffness) * unit_cell_m / cell_m_),
       iterations_(options.iterations) {
   for (size_t axis = 0; axis < 3; ++axis)
     size_[axis] = static_cast<int>(std::ceil((hull.grid().size[axis] - 1) * hull.grid().voxel_m / options.cell_m)) + 1;
-  find_nodes(hull);
-  make_rows();
+  find_nodes(hull, samples);
 }
 
 /// Every node takes over the neighbour's nearest sample where it is nearer than its own (after P.-E. Danielsson,
 /// "Euclidean distance mapping", 1980), from the samples on through the whole inside and a little outside.
-void SmoothDistance::find_nodes(const Field& hull) {
+void SmoothDistance::find_nodes(const Field& hull, std::span<const HullSample> samples) {
   const size_t count = static_cast<size_t>(size_[0]) * static_cast<size_t>(size_[1]) * static_cast<size_t>(size_[2]);
   std::vector<int32_t> nearest(count, -1);
   std::vector<float> distance2(count, std::numeric_limits<float>::max());
@@ -70,15 +68,15 @@ void SmoothDistance::find_nodes(const Field& hull) {
   const auto offer = [&](int i, int j, int k, int32_t sample) {
     if (i < 0 || j < 0 || k < 0 || i >= size_[0] || j >= size_[1] || k >= size_[2]) return;
     const Eigen::Vector3f at(static_cast<float>(i), static_cast<float>(j), static_cast<float>(k));
-    const float d2 = (in_cells(samples_[static_cast<size_t>(sample)].position) - at).squaredNorm();
+    const float d2 = (in_cells(samples[static_cast<size_t>(sample)].position) - at).squaredNorm();
     const size_t n = index(i, j, k);
     if (d2 >= distance2[n]) return;
     distance2[n] = d2;
     nearest[n] = sample;
     next.push_back({i, j, k});
   };
-  for (size_t s = 0; s < samples_.size(); ++s) {
-    const Eigen::Vector3f p = in_cells(samples_[s].position);
+  for (size_t s = 0; s < samples.size(); ++s) {
+    const Eigen::Vector3f p = in_cells(samples[s].position);
     for (int c = 0; c < 8; ++c)
       offer(static_cast<int>(p.x()) + (c & 1), static_cast<int>(p.y()) + (c >> 1 & 1),
             static_cast<int>(p.z()) + (c >> 2), static_cast<int32_t>(s));
@@ -114,11 +112,16 @@ void SmoothDistance::find_nodes(const Field& hull) {
   values_ = start_;
 }
 
-void SmoothDistance::make_rows() {
-  rows_.resize(samples_.size());
-  for (size_t s = 0; s < samples_.size(); ++s) {
-    Row& row = rows_[s];
-    const Eigen::Vector3f p = in_cells(samples_[s].position);
+void SmoothDistance::make_rows(std::span<const HullSample> samples, std::span<const float> weights) {
+  rows_.clear();
+  rows_.reserve(samples.size());
+  for (size_t s = 0; s < samples.size(); ++s) {
+    if (!(weights[s] > 0)) continue;
+    Row row;
+    row.weight = weights[s];
+    row.wanted = samples[s].slack_m;
+    row.normal = samples[s].normal;
+    const Eigen::Vector3f p = in_cells(samples[s].position);
     const Spline x(p.x()), y(p.y()), z(p.z());
     size_t t = 0;
     for (size_t c = 0; c < 3; ++c)
@@ -131,7 +134,7 @@ void SmoothDistance::make_rows() {
           row.slope[1][t] = x.value[a] * y.slope[b] * z.value[c] / cell_m_;
           row.slope[2][t] = x.value[a] * y.value[b] * z.slope[c] / cell_m_;
         }
-    if (std::any_of(row.node.begin(), row.node.end(), [](int32_t n) { return n < 0; })) row.node[0] = -1;
+    if (std::none_of(row.node.begin(), row.node.end(), [](int32_t n) { return n < 0; })) rows_.push_back(row);
   }
 }
 
@@ -159,9 +162,7 @@ void SmoothDistance::multiply(const std::vector<float>& x, std::vector<float>& y
       y[c] += bent;
     }
   }
-  for (size_t s = 0; s < rows_.size(); ++s) {
-    const Row& row = rows_[s];
-    if (!(weights_[s] > 0) || row.node[0] < 0) continue;
+  for (const Row& row : rows_) {
     float value = 0;
     std::array<float, 3> slope{};
     for (size_t t = 0; t < support; ++t) {
@@ -169,16 +170,17 @@ void SmoothDistance::multiply(const std::vector<float>& x, std::vector<float>& y
       value += row.value[t] * v;
       for (size_t axis = 0; axis < 3; ++axis) slope[axis] += row.slope[axis][t] * v;
     }
-    value *= weights_[s];
-    for (float& part : slope) part *= slope_share * weights_[s];
+    value *= row.weight;
+    for (float& part : slope) part *= slope_share * row.weight;
     for (size_t t = 0; t < support; ++t)
       y[static_cast<size_t>(row.node[t])] +=
           value * row.value[t] + slope[0] * row.slope[0][t] + slope[1] * row.slope[1][t] + slope[2] * row.slope[2][t];
   }
 }
 
-void SmoothDistance::solve(std::span<const float> weights, const SmoothDistance* coarser, const Work& work) {
-  weights_ = weights;
+void SmoothDistance::solve(std::span<const HullSample> samples, std::span<const float> weights,
+                           const SmoothDistance* coarser, const Work& work) {
+  make_rows(samples, weights);
   const size_t count = start_.size();
   if (coarser != nullptr)
     for (size_t n = 0; n < count; ++n) {
@@ -190,20 +192,17 @@ void SmoothDistance::solve(std::span<const float> weights, const SmoothDistance*
   constexpr float bending_diagonal = 36;
   std::vector<float> right(count), diagonal(count, attachment + bending_diagonal * stiffness_);
   for (size_t n = 0; n < count; ++n) right[n] = attachment * start_[n];
-  for (size_t s = 0; s < rows_.size(); ++s) {
-    const Row& row = rows_[s];
-    if (!(weights[s] > 0) || row.node[0] < 0) continue;
+  for (const Row& row : rows_)
     for (size_t t = 0; t < support; ++t) {
       const auto n = static_cast<size_t>(row.node[t]);
       float along = 0, square = row.value[t] * row.value[t];
       for (size_t axis = 0; axis < 3; ++axis) {
-        along += samples_[s].normal[static_cast<Eigen::Index>(axis)] * row.slope[axis][t];
+        along += row.normal[static_cast<Eigen::Index>(axis)] * row.slope[axis][t];
         square += slope_share * row.slope[axis][t] * row.slope[axis][t];
       }
-      right[n] += weights[s] * (slope_share * along + row.value[t] * samples_[s].slack_m);
-      diagonal[n] += weights[s] * square;
+      right[n] += row.weight * (slope_share * along + row.value[t] * row.wanted);
+      diagonal[n] += row.weight * square;
     }
-  }
   std::vector<float> residual(count), scaled(count), way, moved(count);
   multiply(values_, moved);
   for (size_t n = 0; n < count; ++n) {
@@ -225,6 +224,23 @@ void SmoothDistance::solve(std::span<const float> weights, const SmoothDistance*
     square = next;
     for (size_t n = 0; n < count; ++n) way[n] = scaled[n] + kept * way[n];
   }
+}
+
+Eigen::Vector3f SmoothDistance::slope(const Eigen::Vector3f& p) const {
+  const Eigen::Vector3f q = in_cells(p);
+  const Spline x(q.x()), y(q.y()), z(q.z());
+  Eigen::Vector3f sum = Eigen::Vector3f::Zero();
+  for (size_t c = 0; c < 3; ++c)
+    for (size_t b = 0; b < 3; ++b)
+      for (size_t a = 0; a < 3; ++a) {
+        const int32_t n =
+            node(x.first + static_cast<int>(a), y.first + static_cast<int>(b), z.first + static_cast<int>(c));
+        if (n < 0) return Eigen::Vector3f::Zero();
+        sum += values_[static_cast<size_t>(n)] * Eigen::Vector3f(x.slope[a] * y.value[b] * z.value[c],
+                                                                 x.value[a] * y.slope[b] * z.value[c],
+                                                                 x.value[a] * y.value[b] * z.slope[c]);
+      }
+  return sum / cell_m_;
 }
 
 std::vector<float> SmoothDistance::spread(std::span<const float> by_sample) const {

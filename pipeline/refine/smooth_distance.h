@@ -27,16 +27,20 @@ struct SmoothDistanceOptions {
 class SmoothDistance {
  public:
   /// @param hull     says where the inside is
-  /// @param samples  of its surface, at least one; they outlive the function
+  /// @param samples  of its surface, at least one; they say where the function is wanted
   SmoothDistance(const Field& hull, std::span<const HullSample> samples, const SmoothDistanceOptions& options);
 
+  /// @param samples  that hold the function
   /// @param weights  by sample, 0 … 1
-  /// @param coarser  where to start from, or nullptr for the distance to the hull
-  void solve(std::span<const float> weights, const SmoothDistance* coarser, const Work& work);
+  /// @param coarser  where to start from, or nullptr for what the function is: at first the distance to the hull
+  void solve(std::span<const HullSample> samples, std::span<const float> weights, const SmoothDistance* coarser,
+             const Work& work);
 
   /// Metres, at a point inside the hull or near it.
   float at(const Eigen::Vector3f& p) const { return interpolate(values_, p); }
-  /// A quantity of the samples, spread to the nodes that they are nearest to, at a point likewise.
+  /// Its gradient there; zero farther away.
+  Eigen::Vector3f slope(const Eigen::Vector3f& p) const;
+  /// A quantity of the constructor's samples, spread to the nodes that they are nearest to, at a point likewise.
   std::vector<float> spread(std::span<const float> by_sample) const;
   float interpolate(const std::vector<float>& by_node, const Eigen::Vector3f& p) const;
 
@@ -44,6 +48,8 @@ class SmoothDistance {
   static constexpr size_t support = 27;
   /// How the function depends on the nodes around a sample.
   struct Row {
+    float weight, wanted;  ///< wanted: the function's value
+    Eigen::Vector3f normal;
     std::array<int32_t, support> node;
     std::array<float, support> value;
     std::array<std::array<float, support>, 3> slope;
@@ -59,12 +65,10 @@ class SmoothDistance {
     return in ? node_of_[index(i, j, k)] : -1;
   }
   Eigen::Vector3f in_cells(const Eigen::Vector3f& p) const { return (p - origin_) / cell_m_; }
-  void find_nodes(const Field& hull);
-  void make_rows();
+  void find_nodes(const Field& hull, std::span<const HullSample> samples);
+  void make_rows(std::span<const HullSample> samples, std::span<const float> weights);
   void multiply(const std::vector<float>& x, std::vector<float>& y) const;
 
-  std::span<const HullSample> samples_;
-  std::span<const float> weights_;
   Eigen::Vector3f origin_;
   float cell_m_;
   float stiffness_;
@@ -77,7 +81,7 @@ class SmoothDistance {
   std::vector<std::array<int, 3>> places_;        ///< by node
   std::vector<std::array<int32_t, 6>> beside_;    ///< by node: towards −x, +x, −y, +y, −z, +z
   std::vector<std::array<int32_t, 3>> diagonal_;  ///< by node: towards +x +y, +x +z, +y +z
-  std::vector<Row> rows_;                         ///< by sample; node[0] is −1 where nodes are missing
+  std::vector<Row> rows_;                         ///< of the samples that hold it and have all their nodes
 };
 
 }  // namespace booth

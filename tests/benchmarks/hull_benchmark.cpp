@@ -47,6 +47,7 @@ struct Inputs {
   Work work = pool.work();
   ReconstructionOptions options;
   Rig rig;
+  FrameSet body;
   std::vector<Silhouette> silhouettes;
 
   Inputs() {
@@ -55,7 +56,7 @@ struct Inputs {
         must(read_recording(named != nullptr ? named : BOOTH_SOURCE_DIR "/replay/recordings/mini"));
     rig = recording.rig;
     const auto background = load_shot(recording, *recording.find(ShotRole::background), work).sets;
-    const FrameSet body = load_shot(recording, *recording.find(ShotRole::body), work).sets.front();
+    body = load_shot(recording, *recording.find(ShotRole::body), work).sets.front();
     silhouettes.resize(body.frames.size());
     work.parallel_for(silhouettes.size(), 1, [&](size_t begin, size_t end) {
       for (size_t i = begin; i < end; ++i) {
@@ -92,7 +93,7 @@ void masks_to_mesh(benchmark::State& state) {
   size_t triangles = 0;
   for (auto _ : state) {
     VisualHull hull = carve(in.options.hull.voxel_m);
-    Field shape = refine_shape(std::move(hull.field), hull.views, in.options.refinement, in.work);
+    Field shape = refine_shape(std::move(hull.field), hull.views, in.body.frames, in.options.refinement, in.work);
     remove_small_handles(shape, in.options.handles, in.work);
     const Mesh surface = smooth_hc(extract_surface(shape, in.work), in.options.smoothing, in.work);
     triangles = decimate(surface, in.options.decimation, in.work).triangles.size();

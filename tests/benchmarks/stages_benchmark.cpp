@@ -65,7 +65,7 @@ struct Inputs {
     load();
     segment_all();
     hull = must(carve_visual_hull(recording.rig, silhouettes, options.hull, work));
-    shape = refine_shape(hull.field, hull.views, options.refinement, work);
+    shape = refine_shape(hull.field, hull.views, body.frames, options.refinement, work);
     remove_small_handles(shape, options.handles, work);
     surface = smooth_hc(extract_surface(shape, work), options.smoothing, work);
     mesh = decimate(surface, options.decimation, work);
@@ -126,8 +126,8 @@ BOOTH_STAGE(load, in.load());
 BOOTH_STAGE(segmentation, in.segment_all());
 BOOTH_STAGE(hull,
             benchmark::DoNotOptimize(carve_visual_hull(in.recording.rig, in.silhouettes, in.options.hull, in.work)));
-BOOTH_STAGE(shape_refinement,
-            benchmark::DoNotOptimize(refine_shape(in.hull.field, in.hull.views, in.options.refinement, in.work)));
+BOOTH_STAGE(shape_refinement, benchmark::DoNotOptimize(refine_shape(in.hull.field, in.hull.views, in.body.frames,
+                                                                    in.options.refinement, in.work)));
 BOOTH_STAGE(handle_removal, Field shape = in.shape;
             benchmark::DoNotOptimize(remove_small_handles(shape, in.options.handles, in.work)));
 BOOTH_STAGE(surface_extraction, benchmark::DoNotOptimize(extract_surface(in.shape, in.work)));

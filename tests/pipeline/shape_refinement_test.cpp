@@ -45,7 +45,7 @@ struct Scene {
     silhouettes = synthetic::render_silhouettes(body, rig, 2);
     hull = carve_visual_hull(rig, silhouettes, {.voxel_m = voxel_m}).value();
   }
-  Field refined(const Work& work = {}) const { return refine_shape(hull.field, hull.views, {}, work); }
+  Field refined(const Work& work = {}) const { return refine_shape(hull.field, hull.views, {}, {}, work); }
 };
 
 bool same(const Field& a, const Field& b) {
@@ -91,7 +91,7 @@ TEST(ShapeRefinement, ChangesABallThatManyCamerasSeeByLessThanATenthOfAVoxel) {
 
 TEST(ShapeRefinement, ReturnsTheHullWhenDisabled) {
   const Scene scene(4);
-  EXPECT_TRUE(same(refine_shape(scene.hull.field, scene.hull.views, {.enabled = false}), scene.hull.field));
+  EXPECT_TRUE(same(refine_shape(scene.hull.field, scene.hull.views, {}, {.enabled = false}), scene.hull.field));
 }
 
 TEST(ShapeRefinement, IsTheSameWithAnyThreadsAndOrderOfCameras) {
@@ -103,7 +103,7 @@ TEST(ShapeRefinement, IsTheSameWithAnyThreadsAndOrderOfCameras) {
   EXPECT_TRUE(same(serial, scene.refined()));
 }
 
-TEST(ShapeRefinement, TakesAnEmptyField) { EXPECT_EQ(refine_shape(Field(), {}, {}).blocks(), 0U); }
+TEST(ShapeRefinement, TakesAnEmptyField) { EXPECT_EQ(refine_shape(Field(), {}, {}, {}).blocks(), 0U); }
 
 }  // namespace
 }  // namespace booth

@@ -45,6 +45,7 @@ class CameraConsistency : public testing::TestWithParam<const char*> {
     RecordedCapture capture = load_capture(*folder, work_);
     rig_ = std::move(capture.rig);
     silhouettes_ = std::move(capture.silhouettes);
+    frames_ = std::move(capture.frames);
     joints_ = read_joints(*folder / "truth/joints.json");
     const Mesh truth = read_ply(*folder / "truth/mesh.ply");
     truth_ = std::make_unique<RayCaster>(truth);
@@ -59,7 +60,7 @@ class CameraConsistency : public testing::TestWithParam<const char*> {
   }
 
   Errors errors_of(const VisualHull& hull) const {
-    const Mesh mesh = extract_surface(refine_shape(hull.field, hull.views, {}, work_), work_);
+    const Mesh mesh = extract_surface(refine_shape(hull.field, hull.views, frames_, {}, work_), work_);
     const RayCaster made(mesh);
     return {mean_distance_m(sample_surface(mesh, samples), *truth_), mean_distance_m(seen_truth_, made)};
   }
@@ -114,6 +115,7 @@ class CameraConsistency : public testing::TestWithParam<const char*> {
   Work work_ = pool_.work();
   Rig rig_;
   std::vector<Silhouette> silhouettes_;
+  std::vector<Frame> frames_;
   std::map<std::string, Eigen::Vector3d> joints_;
   std::unique_ptr<RayCaster> truth_;
   std::vector<Eigen::Vector3d> seen_truth_;

@@ -130,12 +130,31 @@ Eigen::Vector3d colour_at(const Eigen::Vector3d& p) {
   return {0.5 + 0.3 * std::sin(5 * p.y()), 0.5 + 0.3 * std::sin(7 * p.x() + 1), 0.5 + 0.3 * std::cos(9 * p.z())};
 }
 
-Frame render_photograph(const Body& body, const RigCamera& camera, int samples) {
+Eigen::Vector3d cloth_at(const Eigen::Vector3d& p) {
+  constexpr double speckle_m = 0.02;
+  const Eigen::Vector3d at = p / speckle_m;
+  const Eigen::Vector3d first = at.array().floor(), share = at - first;
+  double grey = 0;
+  for (int corner = 0; corner < 8; ++corner) {
+    uint32_t hash = 1;
+    double weight = 1;
+    for (int axis = 0; axis < 3; ++axis) {
+      const int step = corner >> axis & 1;
+      hash = (hash ^ static_cast<uint32_t>(static_cast<int>(first[axis]) + step)) * 2654435761U;
+      hash ^= hash >> 15;
+      weight *= step == 1 ? share[axis] : 1 - share[axis];
+    }
+    grey += weight * (hash >> 8) / static_cast<double>(1U << 24);
+  }
+  return Eigen::Vector3d::Constant(grey);
+}
+
+Frame render_photograph(const Body& body, const RigCamera& camera, int samples, const Paint& paint) {
   auto image = std::make_shared<Image>(camera.intrinsics.width, camera.intrinsics.height, 3);
   const Eigen::Vector3d wall(0.75, 0.76, 0.74);
   for_each_pixel(body, camera, samples, [&](int x, int y, const std::vector<Eigen::Vector3d>& hits) {
     Eigen::Vector3d colour = wall * (samples * samples - static_cast<int>(hits.size()));
-    for (const Eigen::Vector3d& hit : hits) colour += colour_at(hit);
+    for (const Eigen::Vector3d& hit : hits) colour += paint(hit);
     for (int c = 0; c < 3; ++c) image->at(x, y, c) = to_byte(colour[c] / (samples * samples));
   });
   Frame frame;

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <vector>
 
 #include "pipeline/types/frame.h"
@@ -26,10 +27,15 @@ Rig ring_rig(const RigOptions& options = {});
 Silhouette render_silhouette(const Body& body, const RigCamera& camera, int samples = 3);
 std::vector<Silhouette> render_silhouettes(const Body& body, const Rig& rig, int samples = 3);
 
-/// A photograph of the body in a known, smoothly varying colour before a plain wall: colour_at is the surface's
-/// sRGB colour, the same from everywhere.
+/// A surface's sRGB colour, 0 … 1, the same from everywhere.
+using Paint = std::function<Eigen::Vector3d(const Eigen::Vector3d& p_world)>;
+/// Smoothly varying.
 Eigen::Vector3d colour_at(const Eigen::Vector3d& p_world);
-Frame render_photograph(const Body& body, const RigCamera& camera, int samples = 2);
+/// Like cloth: speckles of a few centimetres, nowhere the same again.
+Eigen::Vector3d cloth_at(const Eigen::Vector3d& p_world);
+
+/// A photograph of the painted body before a plain wall.
+Frame render_photograph(const Body& body, const RigCamera& camera, int samples = 2, const Paint& paint = colour_at);
 
 /// Where a ray first meets the body, by sphere tracing; false where it misses.
 bool trace(const Body& body, const Eigen::Vector3d& origin, const Eigen::Vector3d& direction, Eigen::Vector3d* hit);
