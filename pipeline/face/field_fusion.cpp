@@ -5,6 +5,7 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <optional>
 #include <vector>
 
 #include "pipeline/face/ray_caster.h"
@@ -125,6 +126,51 @@ float smooth_step(float from, float to, float value) {
   return t * t * (three - two * t);
 }
 
+/// A surface's vertices by where they are.
+class NearestVertex {
+ public:
+  explicit NearestVertex(const std::vector<Eigen::Vector3f>& positions) : positions_(positions) {
+    for (const Eigen::Vector3f& p : positions) box_.extend(p);
+    size_ = ((box_.sizes() / cell_m).array().floor().cast<int>() + 1).matrix();
+    cells_.resize(static_cast<size_t>(size_.x()) * static_cast<size_t>(size_.y()) * static_cast<size_t>(size_.z()));
+    for (uint32_t v = 0; v < positions.size(); ++v) cells_[index(cell_of(positions[v]))].push_back(v);
+  }
+
+  /// The one nearest to a point, of those within two centimetres.
+  std::optional<uint32_t> operator()(const Eigen::Vector3f& p) const {
+    constexpr int reach = 2;
+    float nearest = (reach * cell_m) * (reach * cell_m);
+    std::optional<uint32_t> found;
+    const Eigen::Vector3i middle = cell_of(p);
+    const Eigen::Vector3i low = (middle.array() - reach).max(0), high = (middle.array() + reach).min(size_.array() - 1);
+    for (int z = low.z(); z <= high.z(); ++z)
+      for (int y = low.y(); y <= high.y(); ++y)
+        for (int x = low.x(); x <= high.x(); ++x)
+          for (const uint32_t v : cells_[index({x, y, z})])
+            if (const float away = (positions_[v] - p).squaredNorm(); away < nearest) {
+              nearest = away;
+              found = v;
+            }
+    return found;
+  }
+
+ private:
+  static constexpr float cell_m = 0.01F;
+  Eigen::Vector3i cell_of(const Eigen::Vector3f& p) const {
+    return ((p - box_.min()) / cell_m).array().floor().cast<int>();
+  }
+  size_t index(const Eigen::Vector3i& cell) const {
+    return (static_cast<size_t>(cell.z()) * static_cast<size_t>(size_.y()) + static_cast<size_t>(cell.y())) *
+               static_cast<size_t>(size_.x()) +
+           static_cast<size_t>(cell.x());
+  }
+
+  const std::vector<Eigen::Vector3f>& positions_;
+  Eigen::AlignedBox3f box_;
+  Eigen::Vector3i size_;
+  std::vector<std::vector<uint32_t>> cells_;
+};
+
 }  // namespace
 
 Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan, const Eigen::Vector3f& eye,
@@ -154,13 +200,24 @@ Field blend_surface(const Field& field, const Mesh& surface, std::span<const flo
   Eigen::AlignedBox3f box;
   for (const auto& triangle : surface.triangles)
     for (const uint32_t v : triangle) box.extend(surface.positions[v]);
+  // Of what lies behind the surface only a little is filled: other parts lie there.
+  constexpr float fill_m = 0.006F, no_fill_m = 0.012F;
+  const auto trust_in = [](float distance) { return distance >= 0 ? 1 : smooth_step(-no_fill_m, -fill_m, distance); };
+  const std::vector<Eigen::Vector3f> normals = vertex_normals(surface);
+  const NearestVertex nearest(surface.positions);
+  const auto along_normal = [&](const Eigen::Vector3f& p, float before) {
+    const auto v = nearest(p);
+    if (!v) return before;
+    const float distance = (p - surface.positions[*v]).dot(normals[*v]);
+    return before + weight[*v] * trust_in(distance) * (distance - before);
+  };
   return rewrite(
       field, box, eye,
       [&](const Eigen::Vector3f& p, float before) {
         const float far = (p - eye).norm();
         const Eigen::Vector3f way = (p - eye) / far;
         const auto hit = rays.cast(eye, way, 0, std::numeric_limits<float>::infinity());
-        if (!hit) return before;
+        if (!hit) return along_normal(p, before);
         const auto& [a, b, c] = surface.triangles[hit->triangle];
         const Eigen::Vector3f &pa = surface.positions[a], &pb = surface.positions[b], &pc = surface.positions[c];
         const Eigen::Vector3f normal = (pb - pa).cross(pc - pa);
@@ -170,14 +227,12 @@ Field blend_surface(const Field& field, const Mesh& surface, std::span<const flo
                     wc = (pa - at).cross(pb - pa).dot(normal) / whole;
         const float share = (1 - wb - wc) * weight[a] + wb * weight[b] + wc * weight[c];
         const float slant = -way.dot(normal) / std::sqrt(whole);
-        constexpr float least_cosine = 0.2F;
-        const float distance = (hit->distance_m - far) * std::max(least_cosine, slant);
-        // Behind the surface only a little is filled, and nothing where sight grazes it: other parts lie there.
-        constexpr float fill_m = 0.006F, no_fill_m = 0.012F, grazing = 0.2F, facing = 0.5F;
-        const float trust = distance >= 0
-                                ? smooth_step(0, least_cosine, slant)
-                                : smooth_step(-no_fill_m, -fill_m, distance) * smooth_step(grazing, facing, slant);
-        return before + share * trust * (distance - before);
+        // Where sight grazes the surface, its depth says little about how far it is.
+        constexpr float grazing = 0.4F, facing = 0.7F;
+        const float facing_share = smooth_step(grazing, facing, slant);
+        const float distance = (hit->distance_m - far) * slant;
+        const float by_sight = before + share * trust_in(distance) * (distance - before);
+        return facing_share >= 1 ? by_sight : facing_share * by_sight + (1 - facing_share) * along_normal(p, before);
       },
       work);
 }

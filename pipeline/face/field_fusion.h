@@ -27,7 +27,9 @@ Field fuse_scan(const Field& field, const HeadRegion& head, const ScanMesh& scan
                 const Work& work = {});
 
 /// Bends a hull's field to a surface that is known everywhere, such as a fitted face: where its weight is 1 the zero
-/// level is the surface, where it is 0 the hull, and between them it goes over smoothly, without a step or a rim.
+/// level is the surface, where it is 0 the hull, and between them it goes over smoothly, without a step or a rim. How
+/// far the surface is is measured along the eye's sight where this faces it, along the surface's normals where it
+/// grazes it.
 ///
 /// @param field    as carve_visual_hull returns it
 /// @param surface  open, world frame, facing the eye; where the eye looks at it more than once, the first counts
