@@ -16,6 +16,7 @@
 #include "pipeline/thread_pool.h"
 #include "replay/recording.h"
 #include "tests/quality/measures.h"
+#include "tests/quality/truth.h"
 
 namespace booth::quality {
 namespace {
@@ -37,24 +38,6 @@ Result<Reconstruction> reconstruct_with_defaults(const Recording& recording) {
   capture.background = load_shot(recording, *recording.find(ShotRole::background), work).sets;
   capture.body = load_shot(recording, *recording.find(ShotRole::body), work).sets.at(0);
   return reconstruct(std::move(capture), {}, {}, work);
-}
-
-CalibratedView view_of(const nlohmann::json& json) {
-  CalibratedView view;
-  view.intrinsics.width = json.at("width");
-  view.intrinsics.height = json.at("height");
-  view.intrinsics.fx = json.at("K")[0][0];
-  view.intrinsics.fy = json.at("K")[1][1];
-  view.intrinsics.cx = json.at("K")[0][2];
-  view.intrinsics.cy = json.at("K")[1][2];
-  for (size_t i = 0; i < 5; ++i) view.intrinsics.distortion[i] = json.at("distortion")[i];
-  for (int row = 0; row < 3; ++row) {
-    for (int column = 0; column < 3; ++column)
-      view.camera_from_world.linear()(row, column) =
-          json.at("R")[static_cast<size_t>(row)][static_cast<size_t>(column)];
-    view.camera_from_world.translation()[row] = json.at("t")[static_cast<size_t>(row)];
-  }
-  return view;
 }
 
 /// The limbs' joints by our name and by the truth's, without the side.
@@ -122,15 +105,10 @@ TEST_P(AvatarQuality, ReachesTheFloors) {
   EXPECT_LE(limbs_m, 0.020);
   RecordProperty("limbs_mean_m", std::to_string(limbs_m));
 
-  if (!fs::exists(folder / "truth/views/views.json")) return;
-  const nlohmann::json views = json_of(folder / "truth/views/views.json");
-  const std::array<uint8_t, 3> background = views.at("background_rgb");
-  for (const nlohmann::json& view : views.at("views")) {
-    const double psnr_db =
-        view_psnr_db(caster, avatar, view_of(view),
-                     image_of(folder / "truth/views" / view.at("file").get<std::string>()), background);
-    EXPECT_GE(psnr_db, 20) << view.at("id");
-    RecordProperty("psnr_db_" + view.at("id").get<std::string>(), std::to_string(psnr_db));
+  for (const HeldOutView& view : read_held_out_views(folder)) {
+    const double psnr_db = view_psnr_db(caster, avatar, view.camera, view.photograph, view.background);
+    EXPECT_GE(psnr_db, 20) << view.id;
+    RecordProperty("psnr_db_" + view.id, std::to_string(psnr_db));
   }
 }
 

@@ -39,6 +39,14 @@ Eigen::Vector3d sample_linear(const Image& image, const Eigen::Vector2f& uv) {
   return colour;
 }
 
+/// Linear light of the avatar's texture.
+Eigen::Vector3d texture_at(const Avatar& avatar, const Hit& hit) {
+  const auto& corners = avatar.atlas.uv[hit.triangle];
+  const Eigen::Vector2f uv =
+      hit.corner_weights[0] * corners[0] + hit.corner_weights[1] * corners[1] + hit.corner_weights[2] * corners[2];
+  return sample_linear(avatar.atlas.image, uv);
+}
+
 }  // namespace
 
 struct RayCaster::Scene {
@@ -258,10 +266,7 @@ double view_psnr_db(const RayCaster& caster, const Avatar& avatar, const Calibra
       if (!is_inside(x, y)) continue;
       const auto hit = caster.cast(view.center(), world_ray(view, Eigen::Vector2d(x, y)));
       if (!hit) continue;
-      const auto& corners = avatar.atlas.uv[hit->triangle];
-      const Eigen::Vector2f uv = hit->corner_weights[0] * corners[0] + hit->corner_weights[1] * corners[1] +
-                                 hit->corner_weights[2] * corners[2];
-      const Eigen::Vector3d colour = sample_linear(avatar.atlas.image, uv);
+      const Eigen::Vector3d colour = texture_at(avatar, *hit);
       std::array<double, 3> true_colour{};
       for (int c = 0; c < 3; ++c) {
         true_colour[static_cast<size_t>(c)] = photograph.at(x, y, c) / 255.0;
@@ -277,6 +282,27 @@ double view_psnr_db(const RayCaster& caster, const Avatar& avatar, const Calibra
   for (size_t i = 0; i < made.size(); ++i)
     for (size_t c = 0; c < 3; ++c) error += std::pow(to_srgb(gain * made[i][c]) - wanted[i][c], 2);
   return -10 * std::log10(std::max(error / (3.0 * static_cast<double>(made.size())), 1e-12));
+}
+
+Image render_view(const RayCaster& caster, const Avatar& avatar, const CalibratedView& view, const Window& window,
+                  const std::array<uint8_t, 3>& background) {
+  constexpr std::array<double, 2> offsets{-0.25, 0.25};
+  const Eigen::Vector3d behind(to_linear(background[0] / 255.0), to_linear(background[1] / 255.0),
+                               to_linear(background[2] / 255.0));
+  Image picture(window.width, window.height, 3);
+  for (int y = 0; y < window.height; ++y)
+    for (int x = 0; x < window.width; ++x) {
+      Eigen::Vector3d light = Eigen::Vector3d::Zero();
+      for (const double dy : offsets)
+        for (const double dx : offsets) {
+          const Eigen::Vector2d pixel(window.left + x + dx, window.top + y + dy);
+          const auto hit = caster.cast(view.center(), world_ray(view, pixel));
+          light += 0.25 * (hit ? texture_at(avatar, *hit) : behind);
+        }
+      for (int c = 0; c < 3; ++c)
+        picture.at(x, y, c) = static_cast<uint8_t>(std::lround(255 * std::clamp(to_srgb(light[c]), 0.0, 1.0)));
+    }
+  return picture;
 }
 
 }  // namespace booth::quality

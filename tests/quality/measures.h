@@ -38,8 +38,8 @@ class RayCaster {
   std::unique_ptr<Scene> scene_;
 };
 
-/// A binary little-endian PLY file's vertices, whose position comes first, and triangles. Throws what the standard library throws at files that are
-/// none: truth files are part of a test.
+/// A binary little-endian PLY file's vertices, whose position comes first, and triangles. Throws what the standard
+/// library throws at files that are none: truth files are part of a test.
 Mesh read_ply(const std::filesystem::path& file);
 
 /// Points evenly spread over a mesh's surface, the same for the same mesh.
@@ -68,5 +68,14 @@ double silhouette_iou(const RayCaster& caster, const RigCamera& camera, const Im
 /// @param background  the photograph's plain background; other pixels are the subject
 double view_psnr_db(const RayCaster& caster, const Avatar& avatar, const CalibratedView& view, const Image& photograph,
                     const std::array<uint8_t, 3>& background);
+
+/// Part of a picture, pixels.
+struct Window {
+  int left = 0, top = 0, width = 0, height = 0;
+};
+
+/// The avatar's flat texture as a view shows it, four rays a pixel, before a plain background.
+Image render_view(const RayCaster& caster, const Avatar& avatar, const CalibratedView& view, const Window& window,
+                  const std::array<uint8_t, 3>& background);
 
 }  // namespace booth::quality
