@@ -250,7 +250,7 @@ std::vector<float> seam_weights(const Mesh& mesh, const Adjacency& adjacency, co
 /// Smooths without shrinking where weights say so.
 /// Source: G. Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995.
 void smooth_seam(const Adjacency& adjacency, const std::vector<float>& weight, const Work& work, Mesh* mesh) {
-  constexpr int rounds = 60;  // smooths away waves of up to a centimetre where edges are a millimetre long
+  constexpr int rounds = 80;  // smooths away waves of up to a centimetre where edges are a millimetre long
   constexpr float inwards = 0.5F, outwards = -0.52F;
   std::vector<uint32_t> seam;
   for (uint32_t v = 0; v < weight.size(); ++v)

@@ -11,7 +11,7 @@ namespace booth {
 struct ScanMeshOptions {
   double most_gap_m = 0.005;         ///< neighbours farther apart are not joined, metres
   double smallest_region_m2 = 4e-4;  ///< connected regions below that area are strays, square metres
-  int narrowest = 6;                 ///< parts narrower than that are lace and dropped, points of the grid; 0: none are
+  int narrowest = 3;                 ///< parts narrower than that are lace and dropped, points of the grid; 0: none are
   int smoothing_radius = 3;          ///< of the planes that average noise, points of the grid, 0 … 10
   double largest_hole_m = 0.03;      ///< holes up to the size of an eye are closed, metres
 };

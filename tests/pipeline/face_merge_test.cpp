@@ -116,8 +116,8 @@ TEST(FuseScan, FillsWhereASilhouetteCutTooDeep) {
 }
 
 TEST(MeshScan, DropsWhatIsNarrow) {
-  // A square of points a millimetre apart, with a strip of three points' width at its side.
-  constexpr int side = 40, reach = 20, strip = 3;
+  // A square of points a millimetre apart, with a strip of two points' width at its side.
+  constexpr int side = 40, reach = 20, strip = 2;
   RangeScan scan(side + reach, side);
   for (int y = 0; y < side; ++y)
     for (int x = 0; x < side + reach; ++x) {
