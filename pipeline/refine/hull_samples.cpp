@@ -82,8 +82,8 @@ constexpr float bend_radius_m = 0.06F;
 
 std::vector<HullSample> sample_hull(const Field& hull, double cell_m) { return Sampling(hull, cell_m).run(); }
 
-void measure_slack(const Field& hull, const SilhouetteViews& views, std::vector<HullSample>& samples,
-                   const Work& work) {
+std::vector<GrazingRay> measure_slack(const Field& hull, const SilhouetteViews& views, std::vector<HullSample>& samples,
+                                      const Work& work) {
   constexpr float step_m = 0.006F, farthest_m = 0.8F, most_m = 1;
   const Grid& grid = hull.grid();
   const Eigen::Vector3f origin = grid.origin.cast<float>();
@@ -104,7 +104,9 @@ void measure_slack(const Field& hull, const SilhouetteViews& views, std::vector<
              ((c & 4) != 0 ? share[2] : 1 - share[2]) * hull.at(n[0] + (c & 1), n[1] + (c >> 1 & 1), n[2] + (c >> 2));
     return sum;
   };
-  const auto measure = [&](HullSample& sample) {
+  std::vector<std::vector<GrazingRay>> rays(samples.size());
+  const auto measure = [&](size_t s) {
+    HullSample& sample = samples[s];
     sample.slack_m = most_m;
     for (const auto& view : views) {
       if (!(std::abs(view->distance_m(sample.position)) < contact_m)) continue;
@@ -121,17 +123,26 @@ void measure_slack(const Field& hull, const SilhouetteViews& views, std::vector<
         }
       }
       if (elsewhere) continue;
+      rays[s].push_back({.sample = s, .direction = ray, .begin_m = -reach[1], .end_m = reach[0]});
       const float length = reach[0] + reach[1], from_middle = 0.5F * (reach[0] - reach[1]);
       const float reach2 = from_middle * from_middle + length * length / 16;
       // So long a stretch also lies by a surface that the ray only touches.
       constexpr float own_m = 1.25F * grazed_m;
       sample.slack_m = std::min(sample.slack_m, std::max(0.0F, reach2 / (2 * bend_radius_m) - own_m));
     }
+    // The views' order is chance.
+    std::sort(rays[s].begin(), rays[s].end(), [](const GrazingRay& a, const GrazingRay& b) {
+      return std::lexicographical_compare(a.direction.begin(), a.direction.end(), b.direction.begin(),
+                                          b.direction.end());
+    });
   };
   constexpr size_t grain = 64;
   work.parallel_for(samples.size(), grain, [&](size_t begin, size_t end) {
-    for (size_t s = begin; s < end; ++s) measure(samples[s]);
+    for (size_t s = begin; s < end; ++s) measure(s);
   });
+  std::vector<GrazingRay> all;
+  for (const auto& of_sample : rays) all.insert(all.end(), of_sample.begin(), of_sample.end());
+  return all;
 }
 
 }  // namespace booth

@@ -4,6 +4,7 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <functional>
 #include <utility>
 #include <vector>
 
@@ -19,6 +20,9 @@ constexpr int side = Field::brick_side;
 constexpr double cell_m = 0.02;  // of the grid on which the surface is looked for
 /// Around sure hull the smooth surface may be this far inside without effect: it knows no details.
 constexpr float detail_m = 0.03F;
+
+/// How far a point is outside a surface, metres; near the surface at least.
+using Distance = std::function<float(const Eigen::Vector3f&)>;
 
 /// What holds the smooth surface, and how strongly.
 struct Evidence {
@@ -69,13 +73,33 @@ void doubt_stray(Evidence& evidence, size_t first, const SmoothDistance& surface
   }
 }
 
-/// Takes away from the hull what lies outside the smooth surface.
-Field carve(Field hull, const SmoothDistance& smooth, const std::vector<float>& spared_m, const Work& work) {
+/// Adds that the surface meets rays which graze the subject, where it does not: at the place where it nearly does.
+/// @param outside_by  how far a point of the hull is outside the surface, metres
+void hold_at_rays(Evidence& evidence, const std::vector<GrazingRay>& rays, const Distance& outside_by) {
+  constexpr float step_m = 0.006F, missed_m = 0.002F;
+  for (const GrazingRay& ray : rays) {
+    const HullSample& sample = evidence.samples[ray.sample];
+    HullSample nearest{.position = sample.position, .normal = sample.normal};
+    float least_m = outside_by(sample.position);
+    for (float t = ray.begin_m; t <= ray.end_m && least_m > missed_m; t += step_m) {
+      const Eigen::Vector3f p = sample.position + t * ray.direction;
+      const float off = outside_by(p);
+      if (off >= least_m) continue;
+      least_m = off;
+      nearest.position = p;
+    }
+    if (least_m <= missed_m) continue;
+    evidence.samples.push_back(nearest);
+    evidence.weights.push_back(1);
+  }
+}
+
+/// Takes away from the hull what lies outside a surface.
+Field carve(Field hull, const Distance& outside_by, const Work& work) {
   const Grid& grid = hull.grid();
   const auto bricks = hull.bricks();
   const auto voxel_m = static_cast<float>(grid.voxel_m);
   const float cut_off_m = 2 * voxel_m;  // as the hull's own
-  const auto outside_by = [&](const Eigen::Vector3f& p) { return smooth.at(p) - smooth.interpolate(spared_m, p); };
   struct Carved {
     size_t brick;
     std::vector<float> values;
@@ -137,7 +161,7 @@ Field refine_shape(Field hull, const SilhouetteViews& views, std::span<const Fra
   if (!options.enabled) return hull;
   Evidence evidence{sample_hull(hull, cell_m), {}};
   if (evidence.samples.empty()) return hull;
-  measure_slack(hull, views, evidence.samples, work);
+  const std::vector<GrazingRay> rays = measure_slack(hull, views, evidence.samples, work);
   evidence.weights = weights_of(evidence.samples, options);
 
   constexpr int coarsest_iterations = 100, iterations = 16;
@@ -155,22 +179,25 @@ Field refine_shape(Field hull, const SilhouetteViews& views, std::span<const Fra
   coarse.solve(evidence.samples, evidence.weights, nullptr, work);
   middle.solve(evidence.samples, evidence.weights, &coarse, work);
   fine.solve(evidence.samples, evidence.weights, &middle, work);
+  const Distance outside_by = [&](const Eigen::Vector3f& p) { return fine.at(p) - fine.interpolate(spared_m, p); };
+  const auto solve = [&](const Evidence& with) {
+    middle.solve(with.samples, with.weights, nullptr, work);
+    fine.solve(with.samples, with.weights, &middle, work);
+  };
+  Evidence all = evidence;
   if (options.photographs && !work.stopped()) {
     const PhotoConsistency photographs(frames, views, hull, work);
-    const auto solve = [&](const Evidence& all) {
-      middle.solve(all.samples, all.weights, nullptr, work);
-      fine.solve(all.samples, all.weights, &middle, work);
-    };
     constexpr double first_inwards_m = 0.03, then_inwards_m = 0.015;
     solve(with_photographs(evidence, photographs, fine, first_inwards_m, options, work));
     // Now it is known better where to look, and how the surface is turned there.
-    Evidence all = with_photographs(evidence, photographs, fine, then_inwards_m, options, work);
+    all = with_photographs(evidence, photographs, fine, then_inwards_m, options, work);
     solve(all);
     doubt_stray(all, evidence.samples.size(), fine);
-    solve(all);
   }
+  hold_at_rays(all, rays, outside_by);
+  solve(all);
   if (work.stopped()) return hull;
-  Field refined = carve(std::move(hull), fine, spared_m, work);
+  Field refined = carve(std::move(hull), outside_by, work);
   keep_largest_part(refined, work);
   return refined;
 }
