@@ -6,7 +6,7 @@
 #include <cstring>
 #include <numbers>
 
-#include "pipeline/structured_light/vector_clones.h"
+#include "pipeline/types/vector_clones.h"
 
 namespace booth {
 namespace {

@@ -12,7 +12,7 @@
 #include "pipeline/structured_light/position_fit.h"
 #include "pipeline/structured_light/stripe_profiles.h"
 #include "pipeline/structured_light/subject_motion.h"
-#include "pipeline/structured_light/vector_clones.h"
+#include "pipeline/types/vector_clones.h"
 
 namespace booth {
 namespace {

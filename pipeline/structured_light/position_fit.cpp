@@ -8,7 +8,7 @@
 #include <limits>
 #include <optional>
 
-#include "pipeline/structured_light/vector_clones.h"
+#include "pipeline/types/vector_clones.h"
 
 namespace booth {
 namespace {

@@ -5,7 +5,7 @@
 #include <limits>
 #include <numbers>
 
-#include "pipeline/structured_light/vector_clones.h"
+#include "pipeline/types/vector_clones.h"
 
 namespace booth {
 namespace {
