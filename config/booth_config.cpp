@@ -409,7 +409,10 @@ void visit_config(Visitor& visitor, BoothConfig& config) {
   visitor.section("trigger", [&](auto& section) { visit_trigger(section, config.trigger); });
   visitor.section("projector", [&](auto& section) { visit_projector(section, config.projector); });
   visitor.section("replay", [&](auto& section) { visit_replay(section, config.replay); });
-  visitor.section("face", [&](auto& section) { section.path("landmark_model", config.face.landmark_model); });
+  visitor.section("face", [&](auto& section) {
+    section.path("landmark_model", config.face.landmark_model);
+    section.path("cascade", config.face.cascade);
+  });
   visitor.section("reconstruct", [&](auto& section) { visit_reconstruct(section, config.reconstruct); });
   visitor.section("export", [&](auto& section) { visit_export(section, config.files); });
 }

@@ -87,6 +87,8 @@ struct JobsConfig {
 struct FaceConfig {
   /// Of the passive face: 68 landmarks, in dlib's format.
   std::filesystem::path landmark_model = "/usr/share/dlib/shape_predictor_68_face_landmarks.dat";
+  /// Of the scanned one: finds it in pictures, in OpenCV's format.
+  std::filesystem::path cascade = "/usr/share/opencv4/haarcascades/haarcascade_frontalface_alt2.xml";
 };
 
 enum class LogLevel { error, warning, info, debug };

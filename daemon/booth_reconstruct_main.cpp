@@ -132,7 +132,8 @@ int run(const Arguments& arguments) {
                     (options.face == FaceMode::automatic && recording->find(ShotRole::gray_code) == nullptr)))
     face_model.start();
   const auto made = reconstruct_recording(
-      arguments.recording, arguments.avatar, options, [&] { return face_model.get(); }, config.files, work,
+      arguments.recording, arguments.avatar, options,
+      {[&] { return face_model.get(); }, [&] { return load_face_detector(config.face.cascade); }}, config.files, work,
       [&](std::string_view stage, double fraction) {
         if (draw) bar.draw(stage, fraction);
         pipe.tell({{"stage", stage}, {"fraction", fraction}});

@@ -92,6 +92,7 @@ class Examination {
     permissions();
     keys();
     landmark_model();
+    face_cascade();
     watchdog();
     return std::move(findings_);
   }
@@ -349,6 +350,13 @@ class Examination {
     warn("landmark_model",
          config_.face.landmark_model.string() + " is not there: faces without a projector stay the hull's own",
          "Install libdlib-data, or name another in [face].");
+  }
+
+  void face_cascade() {
+    if (is_there(at(config_.face.cascade))) return ok("face_cascade", config_.face.cascade.string());
+    warn("face_cascade",
+         config_.face.cascade.string() + " is not there: a scanned face is looked for by the body's shape alone",
+         "Install opencv-data, or name another in [face].");
   }
 
   /// The service's own watchdog notices when boothd hangs; the machine's, when the kernel does.

@@ -33,4 +33,12 @@ Result<FaceModel> FaceModelLoader::get() {
   return *loaded_;
 }
 
+Result<std::shared_ptr<const FaceDetector>> load_face_detector(const std::filesystem::path& cascade) {
+  std::ifstream file(cascade, std::ios::binary);
+  if (!file) return Error{ErrorCode::not_found, cascade.string() + ": the cascade that finds faces cannot be opened"};
+  auto detector = read_face_cascade(file);
+  if (!detector) return Error{detector.error().code, cascade.string() + ": " + detector.error().message};
+  return std::shared_ptr<const FaceDetector>(std::move(*detector));
+}
+
 }  // namespace booth

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <filesystem>
+#include <memory>
 #include <mutex>
 #include <optional>
 #include <thread>
@@ -28,5 +29,11 @@ class FaceModelLoader {
   std::optional<Result<FaceModel>> loaded_;
   std::jthread loading_;
 };
+
+/// Loads what looks for the face that was scanned: some hundredths of a second.
+///
+/// @param cascade  a file as read_face_cascade wants it
+/// @error not_found, invalid_file  naming the file
+Result<std::shared_ptr<const FaceDetector>> load_face_detector(const std::filesystem::path& cascade);
 
 }  // namespace booth

@@ -141,8 +141,8 @@ const std::vector<std::string>& job_stages() {
 
 Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_folder,
                                         const std::filesystem::path& avatar, const ReconstructionOptions& options,
-                                        const FaceModelSource& face_model, const AvatarFileOptions& files,
-                                        const Work& work, const JobProgress& progress, const HealthReport& health) {
+                                        const FaceSources& sources, const AvatarFileOptions& files, const Work& work,
+                                        const JobProgress& progress, const HealthReport& health) {
   // A trailing slash names the same folder.
   const std::filesystem::path target = avatar.has_filename() ? avatar : avatar.parent_path();
   const std::filesystem::path parent = target.has_parent_path() ? target.parent_path() : ".";
@@ -161,7 +161,7 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   if (!capture) return capture.error();
 
   const auto stage_progress = [&](std::string_view stage, double fraction) { clock.tell(stage, fraction); };
-  auto made = reconstruct(*std::move(capture), options, face_model, work, stage_progress, health);
+  auto made = reconstruct(*std::move(capture), options, sources, work, stage_progress, health);
   if (!made) return made.error();
   append(&report.warnings, made->warnings);
 

@@ -30,14 +30,14 @@ struct JobReport {
 ///
 /// @param recording  a folder in the recording format
 /// @param avatar     where the avatar's folder will appear; its parent is made where it is missing
-/// @param face_model as reconstruct() wants it
+/// @param sources    as reconstruct() wants them
 /// @param files      which files the folder gets
 /// @param work       its progress is not used
 /// @error what read_recording and reconstruct return; no_background and no_subject for a recording without these
 ///        shots; invalid_argument when `avatar` is no plain name; invalid_state when something else is there; io,
 ///        disk_full
 Result<JobReport> reconstruct_recording(const std::filesystem::path& recording, const std::filesystem::path& avatar,
-                                        const ReconstructionOptions& options, const FaceModelSource& face_model,
+                                        const ReconstructionOptions& options, const FaceSources& sources,
                                         const AvatarFileOptions& files, const Work& work,
                                         const JobProgress& progress = {}, const HealthReport& health = {});
 

@@ -12,6 +12,7 @@
 #include "pipeline/face/face_evidence.h"
 #include "pipeline/face/face_patch.h"
 #include "pipeline/face/face_pictures.h"
+#include "pipeline/face/face_place.h"
 #include "pipeline/face/face_sewing.h"
 #include "pipeline/face/field_fusion.h"
 #include "pipeline/geometry/solid_parts.h"
@@ -183,11 +184,41 @@ struct FaceSurface {
   std::optional<FittedFace> fit;  ///< of a passive one
 };
 
-Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Silhouette> silhouettes, const Field& hull,
-                              const ReconstructionOptions& options, const Work& work,
-                              std::vector<std::string>* warnings) {
+/// The pictures of the body shot, a camera's with the whole face lit by the projector in place of it: that is where the
+/// face was when it was scanned.
+std::vector<Frame> with_lit_face(std::span<const Frame> frames, const std::optional<GrayCodeCapture>& face) {
+  std::vector<Frame> pictures(frames.begin(), frames.end());
+  if (!face) return pictures;
+  const int all_white = pattern_count(face->pattern) - 2;
+  for (const FrameSet& set : face->sets) {
+    if (set.index != all_white) continue;
+    for (const Frame& lit : set.frames) {
+      std::erase_if(pictures, [&](const Frame& frame) { return frame.camera == lit.camera; });
+      pictures.push_back(lit);
+    }
+  }
+  return pictures;
+}
+
+/// The head about a face that was scanned, by shape and, where there is a detector, by sight.
+std::optional<HeadRegion> find_scanned_head(const CaptureFrames& capture, std::span<const Frame> frames,
+                                            const Mesh& surface, const FaceDetectorSource& source, const Work& work,
+                                            std::vector<std::string>* warnings) {
+  if (!source) return find_head(surface);
+  const auto detector = source();
+  if (!detector) {
+    warnings->push_back("the head was found by the body's shape alone: " + detector.error().message);
+    return find_head(surface);
+  }
+  return find_head(surface, capture.rig, with_lit_face(frames, capture.face), **detector, work);
+}
+
+Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Frame> frames,
+                              std::span<const Silhouette> silhouettes, const Field& hull,
+                              const ReconstructionOptions& options, const FaceDetectorSource& detector,
+                              const Work& work, std::vector<std::string>* warnings) {
   const Mesh surface = extract_surface(hull, work);
-  const auto head = find_head(surface);
+  const auto head = find_scanned_head(capture, frames, surface, detector, work, warnings);
   if (!head) return Error{ErrorCode::no_subject, "no head was found"};
   if (capture.face_scan) {
     const auto placed = place_external_scan(*capture.face_scan, surface, *head, work);
@@ -236,23 +267,23 @@ Result<FaceSurface> fit_face(const VisualHull& hull, std::span<const Frame> fram
 /// The face as asked for, or nothing and in the warnings why.
 std::optional<FaceSurface> make_face(const CaptureFrames& capture, const VisualHull& hull,
                                      std::span<const Frame> frames, std::span<const Silhouette> silhouettes,
-                                     const ReconstructionOptions& options, const FaceModelSource& face_model,
-                                     const Work& work, std::vector<std::string>* warnings) {
+                                     const ReconstructionOptions& options, const FaceSources& sources, const Work& work,
+                                     std::vector<std::string>* warnings) {
   if (options.face == FaceMode::none) return std::nullopt;
   if (wants_scan(options.face) && (capture.face || capture.face_scan)) {
-    auto scanned = scan_face(capture, silhouettes, hull.field, options, work, warnings);
+    auto scanned = scan_face(capture, frames, silhouettes, hull.field, options, sources.detector, work, warnings);
     if (scanned) return std::move(*scanned);
-    const bool fits = options.face == FaceMode::automatic && face_model;
+    const bool fits = options.face == FaceMode::automatic && sources.model;
     warnings->push_back((fits ? "the face was not scanned: " : "the face is the hull's own: ") +
                         scanned.error().message);
     if (!fits) return std::nullopt;
   } else if (options.face == FaceMode::active) {
     warnings->emplace_back("the face is the hull's own: the recording has no structured-light shot");
     return std::nullopt;
-  } else if (options.face == FaceMode::automatic && !face_model) {
+  } else if (options.face == FaceMode::automatic && !sources.model) {
     return std::nullopt;
   }
-  auto fitted = fit_face(hull, frames, options, face_model, work);
+  auto fitted = fit_face(hull, frames, options, sources.model, work);
   if (fitted) return std::move(*fitted);
   warnings->push_back("the face is the hull's own: " + fitted.error().message);
   return std::nullopt;
@@ -341,7 +372,7 @@ const std::vector<std::string>& reconstruction_stages() {
 }
 
 Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOptions& options,
-                                   const FaceModelSource& face_model, const Work& work, const StageProgress& progress,
+                                   const FaceSources& sources, const Work& work, const StageProgress& progress,
                                    const HealthReport& health) {
   if (const auto developed = develop_all(capture, work); !developed) return developed.error();
   if (const auto checked = check(capture.rig); !checked) return checked.error();
@@ -381,7 +412,7 @@ Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOp
   std::optional<FaceSurface> face;
   {
     const StageReport report("face", work, progress);
-    face = make_face(capture, hull, frames, views.silhouettes, options, face_model, report.work(), &warnings);
+    face = make_face(capture, hull, frames, views.silhouettes, options, sources, report.work(), &warnings);
     hull.views.clear();
     capture.face.reset();
     if (work.stopped()) return Work::cancelled();

@@ -9,6 +9,7 @@
 
 #include "pipeline/atlas/texture_atlas.h"
 #include "pipeline/face/control_points.h"
+#include "pipeline/face/face_detector.h"
 #include "pipeline/face/face_merge.h"
 #include "pipeline/face/head_fit.h"
 #include "pipeline/face/landmark_predictor.h"
@@ -77,6 +78,16 @@ struct FaceModel {
 /// make.
 using FaceModelSource = std::function<Result<FaceModel>()>;
 
+/// Gives what finds the face in a picture; never null. Asked at most once a reconstruction, and only when there is a
+/// scan of a face.
+using FaceDetectorSource = std::function<Result<std::shared_ptr<const FaceDetector>>()>;
+
+/// What is loaded only when a face needs it.
+struct FaceSources {
+  FaceModelSource model;        ///< left out, there is no passive face
+  FaceDetectorSource detector;  ///< left out, a scan is looked for where the hull's shape says that the head is
+};
+
 struct Reconstruction {
   Avatar avatar;
   FaceMode face = FaceMode::none;     ///< how it was made: active, passive, or none: the hull's own
@@ -96,7 +107,6 @@ using HealthReport = std::function<void(const std::vector<CameraHealth>& cameras
 /// The whole method: segment → hull → refine → face → surface → atlas → skeleton → skin.
 ///
 /// @param capture     each part of it is freed as soon as no stage needs it any more
-/// @param face_model  for the passive face; left out, there is none
 /// @param work        its progress is not used; stages report through `progress`
 /// A camera that cannot be used is left out with a warning; a shape that cannot be rigged comes back without joints
 /// and with a warning; a face that cannot be had as asked for, or would be worse than the hull's, is the hull's, with a
@@ -104,7 +114,7 @@ using HealthReport = std::function<void(const std::vector<CameraHealth>& cameras
 ///
 /// @error what the stages return, cancelled
 Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOptions& options,
-                                   const FaceModelSource& face_model = {}, const Work& work = {},
+                                   const FaceSources& sources = {}, const Work& work = {},
                                    const StageProgress& progress = {}, const HealthReport& health = {});
 
 }  // namespace booth

@@ -7,6 +7,23 @@
 
 namespace booth {
 
+std::optional<Eigen::Vector3f> surface_barycentre(const Mesh& mesh,
+                                                  const std::function<bool(const Eigen::Vector3f&)>& counts) {
+  Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+  double area = 0;
+  for (const auto& [a, b, c] : mesh.triangles) {
+    const Eigen::Vector3f middle = (mesh.positions[a] + mesh.positions[b] + mesh.positions[c]) / 3;
+    if (!counts(middle)) continue;
+    const Eigen::Vector3f ab = mesh.positions[b] - mesh.positions[a], ac = mesh.positions[c] - mesh.positions[a];
+    const Eigen::Vector3f cross(ab.y() * ac.z() - ab.z() * ac.y(), ab.z() * ac.x() - ab.x() * ac.z(),
+                                ab.x() * ac.y() - ab.y() * ac.x());
+    sum += static_cast<double>(cross.norm()) * middle.cast<double>();
+    area += static_cast<double>(cross.norm());
+  }
+  if (!(area > 0)) return std::nullopt;
+  return Eigen::Vector3f((sum / area).cast<float>());
+}
+
 std::optional<HeadRegion> find_head(const Mesh& mesh) {
   if (mesh.positions.empty()) return std::nullopt;
   float floor = std::numeric_limits<float>::infinity(), crown = -floor;
@@ -48,19 +65,11 @@ std::optional<HeadRegion> find_head(const Mesh& mesh) {
   HeadRegion head;
   head.crown_y = crown;
   head.neck_y = crown - stature * (highest + (lowest - highest) * (static_cast<float>(neck) + 0.5F) / slices);
-  Eigen::Vector3d sum = Eigen::Vector3d::Zero();
-  double area = 0;
-  for (const auto& [a, b, c] : mesh.triangles) {
-    const Eigen::Vector3f middle = (mesh.positions[a] + mesh.positions[b] + mesh.positions[c]) / 3;
-    if (middle.y() < head.neck_y || std::abs(middle.x() - top.x()) > beside * stature) continue;
-    const Eigen::Vector3f ab = mesh.positions[b] - mesh.positions[a], ac = mesh.positions[c] - mesh.positions[a];
-    const Eigen::Vector3f cross(ab.y() * ac.z() - ab.z() * ac.y(), ab.z() * ac.x() - ab.x() * ac.z(),
-                                ab.x() * ac.y() - ab.y() * ac.x());
-    sum += static_cast<double>(cross.norm()) * middle.cast<double>();
-    area += static_cast<double>(cross.norm());
-  }
-  if (!(area > 0)) return std::nullopt;
-  head.barycentre = (sum / area).cast<float>();
+  const auto barycentre = surface_barycentre(mesh, [&](const Eigen::Vector3f& p) {
+    return !(p.y() < head.neck_y) && !(std::abs(p.x() - top.x()) > beside * stature);
+  });
+  if (!barycentre) return std::nullopt;
+  head.barycentre = *barycentre;
   return head;
 }
 

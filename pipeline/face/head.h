@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Geometry>
+#include <functional>
 #include <optional>
 
 #include "pipeline/types/mesh.h"
@@ -31,5 +32,12 @@ struct HeadRegion {
 /// Source: proportions: NASA, "Anthropometric Source Book", 1978 (head height 12 … 14 % of an adult's stature, up to a
 /// fifth of a small child's).
 std::optional<HeadRegion> find_head(const Mesh& mesh);
+
+/// The barycentre of a part of the surface, each triangle by its area; world frame.
+///
+/// @param counts  whether a triangle is of that part, by the middle of its corners
+/// @return nothing where no triangle is
+std::optional<Eigen::Vector3f> surface_barycentre(const Mesh& mesh,
+                                                  const std::function<bool(const Eigen::Vector3f&)>& counts);
 
 }  // namespace booth

@@ -43,6 +43,7 @@ class Doctor : public testing::Test {
     put("/sys/class/net/eth0/operstate", "up\n");
     put("/sys/class/net/eth0/mtu", "9000\n");
     put("/usr/share/dlib/shape_predictor_68_face_landmarks.dat", "");
+    put("/usr/share/opencv4/haarcascades/haarcascade_frontalface_alt2.xml", "");
     put("/var/lib/booth/calibration/rig.json", "{}");
     ASSERT_EQ(::chmod((folder_.path() / "var/lib/booth").c_str(), 0700), 0);
     put_background("2026-11-22T09:00:00Z");
@@ -239,6 +240,10 @@ TEST_F(Doctor, GuardsTheKeys) {
 TEST_F(Doctor, MissesTheLandmarks) {
   remove("/usr/share/dlib");
   expect("landmark_model", "warning");
+}
+TEST_F(Doctor, MissesTheCascade) {
+  remove("/usr/share/opencv4");
+  expect("face_cascade", "warning");
 }
 TEST_F(Doctor, WantsTheMachinesWatchdogUsed) {
   put("/etc/systemd/system.conf", "#RuntimeWatchdogSec=30s\n");

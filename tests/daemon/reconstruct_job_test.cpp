@@ -9,6 +9,7 @@
 #include <random>
 #include <set>
 
+#include "daemon/face_model_loader.h"
 #include "pipeline/export/metadata.h"
 #include "pipeline/thread_pool.h"
 #include "replay/durable_folder.h"
@@ -43,11 +44,12 @@ class ReconstructJob : public testing::Test {
   }
   ~ReconstructJob() override { fs::remove_all(folder_); }
 
-  Result<JobReport> run(const ReconstructionOptions& options = coarse(), const Work& extra = {}) {
+  Result<JobReport> run(const ReconstructionOptions& options = coarse(), const Work& extra = {},
+                        const FaceSources& sources = {}) {
     Work work = pool_.work();
     work.stop = extra.stop;
     return reconstruct_recording(
-        folder_ / "recording", folder_ / "out/avatar", options, {}, {}, work,
+        folder_ / "recording", folder_ / "out/avatar", options, sources, {}, work,
         [this](std::string_view stage, double fraction) { news_.emplace_back(stage, fraction); });
   }
   /// A face scan of which every image is the empty booth's: nothing is projected.
@@ -101,6 +103,27 @@ TEST_F(ReconstructJob, MakesTheAvatarWithoutAFaceScanThatIsTooPoor) {
   EXPECT_TRUE(std::any_of(report->warnings.begin(), report->warnings.end(), [](const std::string& warning) {
     return warning.find("hardly any pixel is lit") != std::string::npos;
   }));
+}
+
+TEST_F(ReconstructJob, NamesTheCascadeThatIsMissingOnceAndOnlyForAScan) {
+  const fs::path missing = folder_ / "cascade.xml", none = folder_ / "recording/recording.json";
+  size_t asked = 0;
+  const auto warnings_about = [&](const fs::path& cascade) {
+    const auto report = run(coarse(), {}, {{}, [&] {
+                                             ++asked;
+                                             return load_face_detector(cascade);
+                                           }});
+    EXPECT_TRUE(report.ok()) << report.error().message;
+    return std::count_if(report->warnings.begin(), report->warnings.end(), [&](const std::string& warning) {
+      return warning.find(cascade.string()) != std::string::npos;
+    });
+  };
+  EXPECT_EQ(warnings_about(missing), 0);
+  EXPECT_EQ(asked, 0U);
+  add_unlit_face_scan();
+  EXPECT_EQ(warnings_about(missing), 1);
+  EXPECT_EQ(asked, 1U);
+  EXPECT_NE(load_face_detector(none).error().message.find(none.string()), std::string::npos);
 }
 
 TEST_F(ReconstructJob, MakesTheAvatarWithoutAFaceFileThatIsUnusable) {

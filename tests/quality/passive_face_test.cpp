@@ -82,8 +82,7 @@ class PassiveFace : public testing::Test {
     });
     ReconstructionOptions options;
     options.face = face;
-    return reconstruct(
-        std::move(capture), options, [] { return Result<FaceModel>(*model_); }, work);
+    return reconstruct(std::move(capture), options, {[] { return Result<FaceModel>(*model_); }, {}}, work);
   }
 
   inline static FaceModel* model_ = nullptr;
