@@ -7,6 +7,8 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <fstream>
+#include <memory>
 #include <numbers>
 #include <optional>
 
@@ -25,6 +27,7 @@ namespace {
 
 using ::testing::Contains;
 using ::testing::HasSubstr;
+using ::testing::Not;
 
 /// The normal of what lies under a point: where the ray against `up` meets the mesh first.
 std::optional<Eigen::Vector3d> normal_under(const Eigen::Vector3d& p, const Eigen::Vector3d& up, const Mesh& mesh,
@@ -98,7 +101,7 @@ class FaceSurface : public testing::TestWithParam<const char*> {
     folder_ = *folder;
     face_ = read_face_recording(folder_, pool_.work());
   }
-  Result<Reconstruction> made_with(GrayCodeCapture face) {
+  Result<Reconstruction> made_with(GrayCodeCapture face, const FaceSources& sources = {}) {
     const Recording recording = read_recording(folder_).value();
     const Work work = pool_.work();
     CaptureFrames capture;
@@ -108,7 +111,16 @@ class FaceSurface : public testing::TestWithParam<const char*> {
     capture.face = std::move(face);
     ReconstructionOptions options;
     options.atlas.size = 512;  // the texture is not looked at
-    return reconstruct(std::move(capture), options, {}, work);
+    return reconstruct(std::move(capture), options, sources, work);
+  }
+  /// As if the projector had stood still: every image shows what the first did.
+  GrayCodeCapture without_patterns() const {
+    GrayCodeCapture still = face_.capture;
+    for (FrameSet& set : still.sets)
+      for (Frame& frame : set.frames)
+        for (const Frame& first : face_.capture.sets.front().frames)
+          if (first.camera == frame.camera) frame.pixels = first.pixels;
+    return still;
   }
   std::filesystem::path folder_;
   ThreadPool pool_;
@@ -137,17 +149,41 @@ TEST_P(FaceSurface, GoesOverIntoTheHullWithoutACrease) {
 }
 
 TEST_P(FaceSurface, IsTheHullsWhereThePatternsAreSpoilt) {
-  // The projector stood still: every image shows what the first did.
-  GrayCodeCapture still = face_.capture;
-  for (FrameSet& set : still.sets)
-    for (Frame& frame : set.frames)
-      for (const Frame& first : face_.capture.sets.front().frames)
-        if (first.camera == frame.camera) frame.pixels = first.pixels;
-  const auto made = made_with(std::move(still));
+  const auto made = made_with(without_patterns());
   ASSERT_TRUE(made.ok()) << made.error().message;
   EXPECT_EQ(made->face, FaceMode::none);
   EXPECT_THAT(made->warnings, Contains(HasSubstr("the face is the hull's own: camera face-")));
   EXPECT_TRUE(topology(made->avatar.mesh).closed_manifold());
+}
+
+TEST_P(FaceSurface, IsThePassiveOneWhereThePatternsAreSpoiltAndThereIsAModel) {
+  constexpr const char* model_file = "/usr/share/dlib/shape_predictor_68_face_landmarks.dat";
+  std::ifstream file(model_file, std::ios::binary);
+  if (!file) GTEST_SKIP() << "no model of landmarks: " << model_file;
+  const FaceModel model{read_dlib_landmarks(file).value(),
+                        std::make_shared<const NeutralHead>(*parse_neutral_head(built_in_neutral_head()))};
+  int asked = 0;
+  const auto made = made_with(without_patterns(), {[&] {
+                                                     ++asked;
+                                                     return Result<FaceModel>(model);
+                                                   },
+                                                   {}});
+  ASSERT_TRUE(made.ok()) << made.error().message;
+  EXPECT_EQ(made->face, FaceMode::passive);
+  EXPECT_EQ(asked, 1);
+  EXPECT_THAT(made->warnings, Contains(HasSubstr("the face was not scanned: camera face-")));
+  EXPECT_THAT(made->warnings, Not(Contains(HasSubstr("the hull's own"))));
+  const Mesh& mesh = made->avatar.mesh;
+  EXPECT_TRUE(topology(mesh).closed_manifold());
+  EXPECT_FALSE(made->avatar.morphs.empty());
+  // Half of the true face lies within a millimetre, as where no scan was taken at all.
+  const RayCaster caster(mesh);
+  std::vector<double> distances;
+  for (const Eigen::Vector3d& p : face_.truth.points) distances.push_back(caster.distance_m(p));
+  ASSERT_FALSE(distances.empty());
+  const auto middle = distances.begin() + static_cast<std::ptrdiff_t>(distances.size() / 2);
+  std::nth_element(distances.begin(), middle, distances.end());
+  EXPECT_LT(*middle, 0.001);
 }
 
 INSTANTIATE_TEST_SUITE_P(Recordings, FaceSurface, testing::Values("man-casual", "woman-casual"), [](const auto& name) {
