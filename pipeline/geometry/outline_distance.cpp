@@ -6,12 +6,31 @@
 #include <cstring>
 #include <limits>
 
+#include "pipeline/types/vector_clones.h"
+
 namespace booth {
 namespace {
 
 constexpr float half_tile_diagonal = 5.657F;  // pixels, of a tile of eight
 
 bool is_subject(uint8_t coverage) { return coverage >= 128; }
+
+/// Lowers the squared distances of samples at (x, y) to those to a piece of outline, where they are larger.
+template <size_t count>
+BOOTH_VECTOR_CLONES void approach(float x0, float y0, float x1, float y1, const std::array<float, count>& x,
+                                  const std::array<float, count>& y, std::array<float, count>& distances2) {
+  const float dx = x1 - x0, dy = y1 - y0;
+  const float inverse = 1 / std::max(dx * dx + dy * dy, 1e-12F);
+  for (size_t s = 0; s < count; ++s) {
+    const float px = x[s] - x0, py = y[s] - y0;
+    float share = (px * dx + py * dy) * inverse;
+    share = share > 0 ? share : 0;
+    share = share < 1 ? share : 1;
+    const float ex = px - share * dx, ey = py - share * dy;
+    const float distance2 = ex * ex + ey * ey;
+    distances2[s] = distance2 < distances2[s] ? distance2 : distances2[s];
+  }
+}
 
 /// Where the coverage passes 127.5 between two pixel centres, as a share of the way.
 float crossing(uint8_t from, uint8_t to) {
@@ -193,21 +212,9 @@ void OutlineDistance::refine(const Image& coverage) {
       // All samples are within half a diagonal of the middle; a piece is at most a pixel's diagonal long.
       constexpr float longest_half = 0.71F;
       const float farthest = nearest + 2 * half_tile_diagonal + longest_half;
-      for (size_t n = 0; n < near.size(); ++n) {
-        if (from_middle[n] > farthest) continue;
-        const auto [x0, y0, x1, y1] = near[n];
-        const float dx = x1 - x0, dy = y1 - y0;
-        const float inverse = 1 / std::max(dx * dx + dy * dy, 1e-12F);
-        for (size_t s = 0; s < samples.size(); ++s) {
-          const float px = along_x[s] - x0, py = along_y[s] - y0;
-          float share = (px * dx + py * dy) * inverse;
-          share = share > 0 ? share : 0;
-          share = share < 1 ? share : 1;
-          const float ex = px - share * dx, ey = py - share * dy;
-          const float distance2 = ex * ex + ey * ey;
-          samples[s] = distance2 < samples[s] ? distance2 : samples[s];
-        }
-      }
+      for (size_t n = 0; n < near.size(); ++n)
+        if (from_middle[n] <= farthest)
+          approach(near[n].x0, near[n].y0, near[n].x1, near[n].y1, along_x, along_y, samples);
       for (int j = 0; j < nodes; ++j)
         for (int i = 0; i < nodes; ++i) {
           float& value = samples[static_cast<size_t>(j * nodes + i)];

@@ -261,21 +261,33 @@ bool PhotoConsistency::look_at(size_t view, const Eigen::Vector3f& middle, const
   across /= half_side;
   along /= half_side;
   const uint8_t* pixels = grey.image.samples.data();
-  const auto stride = static_cast<size_t>(grey.image.width);
+  const int stride = grey.image.width;
+  std::array<int, patch_samples> place_of;
+  Patch u, v;
   size_t s = 0;
-  float sum = 0;
   for (int j = -half_side; j <= half_side; ++j)
     for (int i = -half_side; i <= half_side; ++i, ++s) {
       const float x = at.x() + static_cast<float>(i) * across.x() + static_cast<float>(j) * along.x();
       const float y = at.y() + static_cast<float>(i) * across.y() + static_cast<float>(j) * along.y();
       const auto left = static_cast<int>(x), top = static_cast<int>(y);
-      const float u = x - static_cast<float>(left), w = y - static_cast<float>(top);
-      const uint8_t* p = pixels + static_cast<size_t>(top) * stride + static_cast<size_t>(left);
-      const float upper = static_cast<float>(p[0]) + u * static_cast<float>(p[1] - p[0]);
-      const float lower = static_cast<float>(p[stride]) + u * static_cast<float>(p[stride + 1] - p[stride]);
-      patch[s] = upper + w * (lower - upper);
-      sum += patch[s];
+      u[s] = x - static_cast<float>(left);
+      v[s] = y - static_cast<float>(top);
+      place_of[s] = top * stride + left;
     }
+  Patch a, b, c, d;
+  for (s = 0; s < patch_samples; ++s) {
+    const uint8_t* p = pixels + place_of[s];
+    a[s] = p[0];
+    b[s] = p[1];
+    c[s] = p[stride];
+    d[s] = p[stride + 1];
+  }
+  float sum = 0;
+  for (s = 0; s < patch_samples; ++s) {
+    const float upper = a[s] + u[s] * (b[s] - a[s]), lower = c[s] + u[s] * (d[s] - c[s]);
+    patch[s] = upper + v[s] * (lower - upper);
+    sum += patch[s];
+  }
   const float mean = sum / static_cast<float>(patch_samples);
   float square = 0;
   for (float& value : patch) {

@@ -179,7 +179,7 @@ Field refine_shape(Field hull, const SilhouetteViews& views, std::span<const Fra
   coarse.solve(evidence.samples, evidence.weights, nullptr, work);
   middle.solve(evidence.samples, evidence.weights, &coarse, work);
   fine.solve(evidence.samples, evidence.weights, &middle, work);
-  const Distance outside_by = [&](const Eigen::Vector3f& p) { return fine.at(p) - fine.interpolate(spared_m, p); };
+  const Distance outside_by = [&](const Eigen::Vector3f& p) { return fine.at(p, spared_m); };
   const auto solve = [&](const Evidence& with) {
     middle.solve(with.samples, with.weights, nullptr, work);
     fine.solve(with.samples, with.weights, &middle, work);

@@ -249,21 +249,32 @@ std::vector<float> SmoothDistance::spread(std::span<const float> by_sample) cons
   return by_node;
 }
 
-float SmoothDistance::interpolate(const std::vector<float>& by_node, const Eigen::Vector3f& p) const {
+template <class Value>
+float SmoothDistance::interpolate(const Eigen::Vector3f& p, const Value& value_of) const {
   const Eigen::Vector3f q = in_cells(p);
   const Spline x(q.x()), y(q.y()), z(q.z());
   float sum = 0, total = 0;
   for (size_t c = 0; c < 3; ++c)
-    for (size_t b = 0; b < 3; ++b)
+    for (size_t b = 0; b < 3; ++b) {
+      const float across = y.value[b] * z.value[c];
       for (size_t a = 0; a < 3; ++a) {
         const int32_t n =
             node(x.first + static_cast<int>(a), y.first + static_cast<int>(b), z.first + static_cast<int>(c));
         if (n < 0) continue;
-        const float weight = x.value[a] * y.value[b] * z.value[c];
-        sum += weight * by_node[static_cast<size_t>(n)];
+        const float weight = x.value[a] * across;
+        sum += weight * value_of(static_cast<size_t>(n));
         total += weight;
       }
+    }
   return total > 0 ? sum / total : 0;
+}
+
+float SmoothDistance::at(const Eigen::Vector3f& p) const {
+  return interpolate(p, [&](size_t n) { return values_[n]; });
+}
+
+float SmoothDistance::at(const Eigen::Vector3f& p, const std::vector<float>& less) const {
+  return interpolate(p, [&](size_t n) { return values_[n] - less[n]; });
 }
 
 }  // namespace booth

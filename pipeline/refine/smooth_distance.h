@@ -37,12 +37,13 @@ class SmoothDistance {
              const Work& work);
 
   /// Metres, at a point inside the hull or near it.
-  float at(const Eigen::Vector3f& p) const { return interpolate(values_, p); }
+  float at(const Eigen::Vector3f& p) const;
   /// Its gradient there; zero farther away.
   Eigen::Vector3f slope(const Eigen::Vector3f& p) const;
-  /// A quantity of the constructor's samples, spread to the nodes that they are nearest to, at a point likewise.
+  /// A quantity of the constructor's samples, spread to the nodes that they are nearest to.
   std::vector<float> spread(std::span<const float> by_sample) const;
-  float interpolate(const std::vector<float>& by_node, const Eigen::Vector3f& p) const;
+  /// The same less a quantity of the nodes.
+  float at(const Eigen::Vector3f& p, const std::vector<float>& less) const;
 
  private:
   static constexpr size_t support = 27;
@@ -64,6 +65,8 @@ class SmoothDistance {
     const bool in = i >= 0 && j >= 0 && k >= 0 && i < size_[0] && j < size_[1] && k < size_[2];
     return in ? node_of_[index(i, j, k)] : -1;
   }
+  template <class Value>
+  float interpolate(const Eigen::Vector3f& p, const Value& value_of) const;
   Eigen::Vector3f in_cells(const Eigen::Vector3f& p) const { return (p - origin_) / cell_m_; }
   void find_nodes(const Field& hull, std::span<const HullSample> samples);
   void make_rows(std::span<const HullSample> samples, std::span<const float> weights);
