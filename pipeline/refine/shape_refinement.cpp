@@ -164,7 +164,7 @@ Field refine_shape(Field hull, const SilhouetteViews& views, std::span<const Fra
   const std::vector<GrazingRay> rays = measure_slack(hull, views, evidence.samples, work);
   evidence.weights = weights_of(evidence.samples, options);
 
-  constexpr int coarsest_iterations = 100, iterations = 16;
+  constexpr int coarsest_iterations = 100, iterations = 10;
   SmoothDistance coarse(hull, evidence.samples, {4 * cell_m, options.stiffness, coarsest_iterations});
   SmoothDistance middle(hull, evidence.samples, {2 * cell_m, options.stiffness, iterations});
   SmoothDistance fine(hull, evidence.samples, {cell_m, options.stiffness, iterations});
