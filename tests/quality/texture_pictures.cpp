@@ -5,7 +5,6 @@
 
 #include <algorithm>
 #include <exception>
-#include <fstream>
 #include <iostream>
 #include <stdexcept>
 #include <string>
@@ -13,34 +12,14 @@
 #include <vector>
 
 #include "pipeline/atlas/texture_atlas.h"
-#include "pipeline/image/codec.h"
 #include "pipeline/thread_pool.h"
 #include "tests/quality/measures.h"
+#include "tests/quality/panels.h"
 #include "tests/quality/recorded_capture.h"
 #include "tests/quality/truth.h"
 
 namespace booth::quality {
 namespace {
-
-Image part_of(const Image& image, const Window& window) {
-  if (window.left < 0 || window.top < 0 || window.width < 1 || window.height < 1 ||
-      window.left + window.width > image.width || window.top + window.height > image.height)
-    throw std::runtime_error("the part does not lie in the photograph");
-  Image part(window.width, window.height, 3);
-  for (int y = 0; y < part.height; ++y)
-    std::copy_n(image.pixel(window.left, window.top + y), 3 * part.width, part.pixel(0, y));
-  return part;
-}
-
-Image side_by_side(const std::vector<Image>& panels) {
-  constexpr int gap = 6;
-  const int width = panels[0].width, count = static_cast<int>(panels.size());
-  Image all(count * width + (count - 1) * gap, panels[0].height, 3, uint8_t{255});
-  for (int i = 0; i < count; ++i)
-    for (int y = 0; y < all.height; ++y)
-      std::copy_n(panels[static_cast<size_t>(i)].pixel(0, y), 3 * width, all.pixel(i * (width + gap), y));
-  return all;
-}
 
 void run(const std::string& recording, const std::string& mesh, const std::string& id, const Window& window,
          const std::string& out) {
@@ -61,10 +40,7 @@ void run(const std::string& recording, const std::string& mesh, const std::strin
     avatar.atlas = std::move(textured->atlas);
     panels.push_back(render_view(caster, avatar, view->camera, window, view->background));
   }
-  constexpr int quality = 85;
-  const std::vector<uint8_t> bytes = encode_jpeg(side_by_side(panels), quality);
-  std::ofstream(out, std::ios::binary)
-      .write(reinterpret_cast<const char*>(bytes.data()), static_cast<std::streamsize>(bytes.size()));
+  write_jpeg(in_rows({panels}), out);
 }
 
 }  // namespace
