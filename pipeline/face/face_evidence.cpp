@@ -26,6 +26,25 @@ double share_outside(const FacePatch& fitted, const SilhouetteViews& views) {
   return all > 0 ? static_cast<double>(outside) / static_cast<double>(all) : 0;
 }
 
+/// The triangles of a mesh that touch a box; the positions stay as they are.
+Mesh within(const Mesh& mesh, const Eigen::AlignedBox3f& box) {
+  Mesh part;
+  part.positions = mesh.positions;
+  for (const auto& t : mesh.triangles)
+    if (std::any_of(t.begin(), t.end(), [&](uint32_t v) { return box.contains(mesh.positions[v]); }))
+      part.triangles.push_back(t);
+  return part;
+}
+
+/// The patch and as far around it as the hull may be from it.
+Eigen::AlignedBox3f surroundings(const FacePatch& fitted) {
+  Eigen::AlignedBox3f box;
+  for (const Eigen::Vector3f& p : fitted.mesh.positions) box.extend(p);
+  constexpr float around_m = 0.08F;
+  const Eigen::Vector3f around = Eigen::Vector3f::Constant(around_m);
+  return {box.min() - around, box.max() + around};
+}
+
 }  // namespace
 
 std::optional<std::string> FaceEvidence::objection() const {
@@ -40,7 +59,7 @@ std::optional<std::string> FaceEvidence::objection() const {
   return std::nullopt;
 }
 
-FaceEvidence weigh_face(std::span<const FacePicture> seen, const FaceControlPoints& controls, const Mesh& hull,
+FaceEvidence weigh_face(std::span<const FacePicture> seen, const FaceControlPoints& controls, const Mesh& whole_hull,
                         const FacePatch& fitted, const SilhouetteViews& views, const Work& work) {
   FaceEvidence evidence;
   evidence.outside_outline = share_outside(fitted, views);
@@ -59,6 +78,7 @@ FaceEvidence weigh_face(std::span<const FacePicture> seen, const FaceControlPoin
   for (const PinholePicture& picture : pictures)
     if (&picture != &*reference) others.push_back(&picture);
 
+  const Mesh hull = within(whole_hull, surroundings(fitted));
   const std::vector<Eigen::Vector3f> fitted_normals = vertex_normals(fitted.mesh), hull_normals = vertex_normals(hull);
   const RayCaster hull_rays(hull);
   const Eigen::Vector3f eye = reference->view.center().cast<float>();

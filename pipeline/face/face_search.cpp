@@ -22,6 +22,7 @@ struct Candidate {
   const RigCamera* camera = nullptr;
   const Image* picture = nullptr;
   double merit = 0;
+  double aside_rad = 0;  ///< how far to the side of the booth's front the camera stands: to +X positive
 };
 
 /// How much of the world around the head is searched.
@@ -51,7 +52,8 @@ std::vector<Candidate> candidates_of(const Rig& rig, std::span<const Frame> fram
     constexpr double most_aside = -0.17, fewest_pixels_per_metre = 150;
     const double frontal = to_camera.z() / std::hypot(to_camera.x(), to_camera.z());
     if (frontal < most_aside || pixels_per_metre < fewest_pixels_per_metre) continue;
-    candidates.push_back({camera, frame.pixels.get(), (1 + frontal) * std::sqrt(pixels_per_metre)});
+    candidates.push_back({camera, frame.pixels.get(), (1 + frontal) * std::sqrt(pixels_per_metre),
+                          std::atan2(to_camera.x(), to_camera.z())});
   }
   std::sort(candidates.begin(), candidates.end(), [](const Candidate& a, const Candidate& b) {
     return a.merit != b.merit ? a.merit > b.merit : a.camera->id < b.camera->id;
@@ -111,11 +113,11 @@ RepeatedPrediction predict_repeatedly(const LandmarkPredictor& predictor, const 
 }
 
 /// The face that a camera sees around the head, if it sees one.
-std::optional<SeenFace> find_face(const Candidate& candidate, const HeadRegion& head,
+/// @param searched_px  width of the picture in which the face is looked for
+std::optional<SeenFace> find_face(const Candidate& candidate, const HeadRegion& head, int searched_px,
                                   const LandmarkPredictor& predictor) {
   const RigCamera& camera = *candidate.camera;
   const Eigen::Vector3d middle = head.barycentre.cast<double>();
-  constexpr int searched_px = 320;  // a face's box is some 120 wide then; detectors want 80
   const double searched_m = searched_width(head);
   const auto view = upright_view(camera, middle, searched_m, searched_px);
   if (!view) return std::nullopt;
@@ -152,15 +154,36 @@ std::optional<SeenFace> find_face(const Candidate& candidate, const HeadRegion& 
   return seen;
 }
 
+/// Whether faces were seen from both sides of the booth's front: then cameras beyond see the head's sides.
+bool seen_from_both_sides(const std::vector<Candidate>& candidates, const std::vector<std::optional<SeenFace>>& found) {
+  constexpr double clearly_rad = 0.1;
+  bool left = false, right = false;
+  for (size_t i = 0; i < candidates.size(); ++i) {
+    left = left || (found[i] && candidates[i].aside_rad > clearly_rad);
+    right = right || (found[i] && candidates[i].aside_rad < -clearly_rad);
+  }
+  return left && right;
+}
+
 }  // namespace
 
 FaceSearch search_faces(const Rig& rig, std::span<const Frame> frames, const HeadRegion& head,
                         const LandmarkPredictor& predictor, size_t most_cameras, const Work& work) {
   const auto candidates = candidates_of(rig, frames, head.barycentre.cast<double>(), most_cameras);
   std::vector<std::optional<SeenFace>> found(candidates.size());
-  work.parallel_for(candidates.size(), 1, [&](size_t begin, size_t end) {
-    for (size_t i = begin; i < end && !work.stopped(); ++i) found[i] = find_face(candidates[i], head, predictor);
-  });
+  const auto look = [&](double farthest_aside_rad, int searched_px) {
+    work.parallel_for(candidates.size(), 1, [&](size_t begin, size_t end) {
+      for (size_t i = begin; i < end && !work.stopped(); ++i)
+        if (!found[i] && std::abs(candidates[i].aside_rad) < farthest_aside_rad)
+          found[i] = find_face(candidates[i], head, searched_px, predictor);
+    });
+  };
+  // Detectors want a face's box to be 80 pixels wide. It is 95 or more in the small picture, unless what seems to be
+  // the head is much larger than it, or smaller than heads are: then the large one shows the face as well.
+  constexpr int small_px = 256, large_px = 320;
+  constexpr double frontal_rad = 1.2, anywhere_rad = 3.2;
+  look(frontal_rad, small_px);
+  if (!seen_from_both_sides(candidates, found)) look(anywhere_rad, large_px);
   FaceSearch search;
   search.searched = candidates.size();
   for (auto& face : found)

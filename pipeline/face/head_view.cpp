@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
+#include <vector>
 
 #include "pipeline/geometry/camera_model.h"
 
@@ -31,7 +33,7 @@ float matte(const Image& picture, int x, int y) {
   return linear[p[0]] - linear[p[2]];
 }
 
-/// Linear between the values of four pixels; 0 outside.
+/// Linear between the values of four pixels; 0 outside and at no place.
 template <class Value>
 float sample(const Image& picture, const Eigen::Vector2d& at, Value&& value) {
   if (!(at.x() >= 0 && at.y() >= 0 && at.x() <= picture.width - 1 && at.y() <= picture.height - 1)) return 0;
@@ -60,6 +62,39 @@ class ViewToCamera {
   Eigen::Matrix3d turn_;
 };
 
+/// Where the view's pixels lie in the camera's picture, linear between the nodes of a grid over the view: over so few
+/// pixels neither a lens nor the change of direction bends a line by a hundredth of a pixel.
+class PixelMap {
+ public:
+  explicit PixelMap(const CalibratedView& camera, const CalibratedView& view)
+      : columns_(view.intrinsics.width / cell + 2), rows_(view.intrinsics.height / cell + 2) {
+    const ViewToCamera to_camera(camera, view);
+    nodes_.reserve(static_cast<size_t>(columns_) * static_cast<size_t>(rows_));
+    for (int row = 0; row < rows_; ++row)
+      for (int column = 0; column < columns_; ++column)
+        nodes_.push_back(to_camera(column * cell + first, row * cell + first)
+                             .value_or(Eigen::Vector2d::Constant(std::numeric_limits<double>::quiet_NaN())));
+  }
+
+  /// @param x, y  within half a pixel of the view
+  /// @return not a number near where the camera's model ends
+  Eigen::Vector2d operator()(double x, double y) const {
+    const double across = (x - first) / cell, down = (y - first) / cell;
+    const int column = static_cast<int>(across), row = static_cast<int>(down);
+    const double u = across - column, v = down - row;
+    const Eigen::Vector2d* upper =
+        &nodes_[static_cast<size_t>(row) * static_cast<size_t>(columns_) + static_cast<size_t>(column)];
+    const Eigen::Vector2d* lower = upper + columns_;
+    return (1 - v) * ((1 - u) * upper[0] + u * upper[1]) + v * ((1 - u) * lower[0] + u * lower[1]);
+  }
+
+ private:
+  static constexpr int cell = 4;          // pixels of the view
+  static constexpr double first = -0.5;  // where the first pixel begins
+  int columns_, rows_;
+  std::vector<Eigen::Vector2d> nodes_;
+};
+
 /// Samples a value of the picture at every pixel of the view, averaged where the picture is finer.
 template <class Value, class Put>
 void render(const CalibratedView& camera, const Image& picture, const CalibratedView& view, Value&& value, Put&& put) {
@@ -71,12 +106,13 @@ void render(const CalibratedView& camera, const Image& picture, const Calibrated
   constexpr int most_samples = 8;
   const int samples =
       static_cast<int>(std::clamp(std::ceil((*aside - *middle).norm() - 0.25), 1.0, double{most_samples}));
+  const PixelMap in_picture(camera, view);
   for (int y = 0; y < view.intrinsics.height; ++y)
     for (int x = 0; x < view.intrinsics.width; ++x) {
       float sum = 0;
       for (int i = 0; i < samples * samples; ++i) {
         const double across = (i % samples + 0.5) / samples - 0.5, down = (i / samples + 0.5) / samples - 0.5;
-        if (const auto at = to_camera(x + across, y + down)) sum += sample(picture, *at, value);
+        sum += sample(picture, in_picture(x + across, y + down), value);
       }
       put(x, y, sum / static_cast<float>(samples * samples));
     }
