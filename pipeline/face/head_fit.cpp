@@ -180,13 +180,14 @@ struct Pull {
 };
 
 /// The displacements with the least energy plus squared pulls. Pulls couple x, y and z, the energy does not: conjugate
-/// gradients over all, preconditioned by one factorization that takes every pull for isotropic.
+/// gradients over all, preconditioned by a factorization that takes every pull for isotropic.
 class DisplacementSolver {
  public:
   /// @param energy  with an entry for every two corners of a triangle, which is where pulls add theirs
   explicit DisplacementSolver(Sparse energy) : energy_(std::move(energy)) { factor_.analyzePattern(energy_); }
 
-  void solve(const std::vector<Pull>& pulls, Positions* displacement) {
+  /// Prepares for pulls much like these.
+  void precondition(const std::vector<Pull>& pulls) {
     std::vector<Eigen::Triplet<double>> entries;
     for (const Pull& pull : pulls) {
       const double isotropic = pull.information.trace() / 3;
@@ -198,13 +199,15 @@ class DisplacementSolver {
     Sparse pulled(energy_.rows(), energy_.cols());
     pulled.setFromTriplets(entries.begin(), entries.end());
     factor_.factorize(energy_ + pulled);
+  }
 
+  void solve(const std::vector<Pull>& pulls, Positions* displacement) const {
     Positions right = Positions::Zero(energy_.rows(), 3);
     for (const Pull& pull : pulls) add(pull, pull.information * pull.wanted, &right);
     Positions residual = right - apply(pulls, *displacement);
     constexpr double precision = 1e-3;
     const double enough = precision * right.norm();
-    Positions improved = factor_.solve(residual), direction = improved;
+    Positions improved = solve_factored(residual), direction = improved;
     double progress = residual.cwiseProduct(improved).sum();
     constexpr int most_steps = 15;
     for (int step = 0; step < most_steps && residual.norm() > enough; ++step) {
@@ -212,7 +215,7 @@ class DisplacementSolver {
       const double length = progress / direction.cwiseProduct(image).sum();
       *displacement += length * direction;
       residual -= length * image;
-      improved = factor_.solve(residual);
+      improved = solve_factored(residual);
       const double next = residual.cwiseProduct(improved).sum();
       direction = improved + (next / progress) * direction;
       progress = next;
@@ -231,6 +234,31 @@ class DisplacementSolver {
       add(pull, pull.information * at, &result);
     }
     return result;
+  }
+
+  /// What factor_.solve(right) is, with x, y and z side by side: the factor is read once for all three.
+  Positions solve_factored(const Positions& right) const {
+    using Row = Eigen::Array4d;  // and a lane that is left 0
+    const auto& lower = factor_.matrixL().nestedExpression();
+    const auto& place = factor_.permutationP().indices();
+    const Eigen::VectorXd diagonal = factor_.vectorD();
+    const auto count = static_cast<int>(right.rows());
+    std::vector<Row> x(static_cast<size_t>(count));
+    for (int i = 0; i < count; ++i) x[static_cast<size_t>(place[i])] << right.row(i).transpose().array(), 0;
+    const int *begin = lower.outerIndexPtr(), *row = lower.innerIndexPtr();
+    const double* value = lower.valuePtr();
+    for (int j = 0; j < count; ++j) {
+      const Row known = x[static_cast<size_t>(j)];
+      for (int k = begin[j]; k < begin[j + 1]; ++k) x[static_cast<size_t>(row[k])] -= value[k] * known;
+    }
+    for (int j = count - 1; j >= 0; --j) {
+      Row unknown = x[static_cast<size_t>(j)] / diagonal[j];
+      for (int k = begin[j]; k < begin[j + 1]; ++k) unknown -= value[k] * x[static_cast<size_t>(row[k])];
+      x[static_cast<size_t>(j)] = unknown;
+    }
+    Positions solved(count, 3);
+    for (int i = 0; i < count; ++i) solved.row(i) = x[static_cast<size_t>(place[i])].head<3>().transpose();
+    return solved;
   }
 
   Sparse energy_;
@@ -298,19 +326,20 @@ class HeadOutline {
   size_t index(int x, int y) const {
     return static_cast<size_t>(y) * static_cast<size_t>(width_) + static_cast<size_t>(x);
   }
-  /// Marks the cells whose centres a triangle covers, and those of its corners.
+  /// Marks the cells whose centres a triangle covers that faces the camera, and those of its corners.
   void cover(const Eigen::Vector2f& a, const Eigen::Vector2f& b, const Eigen::Vector2f& c) {
-    for (const Eigen::Vector2f& p : {a, b, c}) covered_[index(static_cast<int>(p.x()), static_cast<int>(p.y()))] = 1;
     const auto side = [](const Eigen::Vector2f& p, const Eigen::Vector2f& q, float x, float y) {
       return (q.x() - p.x()) * (y - p.y()) - (q.y() - p.y()) * (x - p.x());
     };
+    if (side(a, b, c.x(), c.y()) > 0) return;  // counter-clockwise from outside, and rows run down
+    for (const Eigen::Vector2f& p : {a, b, c}) covered_[index(static_cast<int>(p.x()), static_cast<int>(p.y()))] = 1;
     const Eigen::Vector2f low = a.cwiseMin(b).cwiseMin(c), high = a.cwiseMax(b).cwiseMax(c);
     for (int y = static_cast<int>(low.y()); y <= static_cast<int>(high.y()); ++y)
       for (int x = static_cast<int>(low.x()); x <= static_cast<int>(high.x()); ++x) {
         constexpr float centre = 0.5F;
         const float px = static_cast<float>(x) + centre, py = static_cast<float>(y) + centre;
         const float s = side(a, b, px, py), t = side(b, c, px, py), u = side(c, a, px, py);
-        if ((s >= 0 && t >= 0 && u >= 0) || (s <= 0 && t <= 0 && u <= 0)) covered_[index(x, y)] = 1;
+        if (s <= 0 && t <= 0 && u <= 0) covered_[index(x, y)] = 1;
       }
   }
 
@@ -650,6 +679,8 @@ size_t bend_smoothly(const NeutralHead& neutral, const std::vector<Target>& targ
     pulls.insert(pulls.end(), silhouette_pulls.begin(), silhouette_pulls.end());
     if (round >= first_with_pictures)
       add_picture_pulls(neutral, pictures, similarity, round < first_near, displacement, *head, work, &pulls);
+    // Those of later rounds are much alike.
+    if (round <= first_with_pictures) solver.precondition(pulls);
     solver.solve(pulls, &displacement);
     set_positions(aligned + displacement, head);
   }

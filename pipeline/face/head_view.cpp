@@ -1,5 +1,6 @@
 #include "pipeline/face/head_view.h"
 
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -31,17 +32,6 @@ float matte(const Image& picture, int x, int y) {
   }();
   const uint8_t* p = picture.pixel(x, y);
   return linear[p[0]] - linear[p[2]];
-}
-
-/// Linear between the values of four pixels; 0 outside and at no place.
-template <class Value>
-float sample(const Image& picture, const Eigen::Vector2d& at, Value&& value) {
-  if (!(at.x() >= 0 && at.y() >= 0 && at.x() <= picture.width - 1 && at.y() <= picture.height - 1)) return 0;
-  const int x = std::min(static_cast<int>(at.x()), picture.width - 2),
-            y = std::min(static_cast<int>(at.y()), picture.height - 2);
-  const auto fx = static_cast<float>(at.x() - x), fy = static_cast<float>(at.y() - y);
-  return (1 - fy) * ((1 - fx) * value(picture, x, y) + fx * value(picture, x + 1, y)) +
-         fy * ((1 - fx) * value(picture, x, y + 1) + fx * value(picture, x + 1, y + 1));
 }
 
 /// From the view's pixels to the camera's, without a world between.
@@ -88,11 +78,53 @@ class PixelMap {
     return (1 - v) * ((1 - u) * upper[0] + u * upper[1]) + v * ((1 - u) * lower[0] + u * lower[1]);
   }
 
+  /// Where all of them lie.
+  Eigen::AlignedBox2d extent() const {
+    Eigen::AlignedBox2d box;
+    for (const Eigen::Vector2d& node : nodes_)
+      if (!node.hasNaN()) box.extend(node);
+    return box;
+  }
+
  private:
-  static constexpr int cell = 4;          // pixels of the view
+  static constexpr int cell = 4;         // pixels of the view
   static constexpr double first = -0.5;  // where the first pixel begins
   int columns_, rows_;
   std::vector<Eigen::Vector2d> nodes_;
+};
+
+/// A value of the pixels of that part of a picture which a view shows.
+class PictureValues {
+ public:
+  template <class Value>
+  PictureValues(const Image& picture, const Eigen::AlignedBox2d& shown, Value&& value)
+      : last_x_(picture.width - 1), last_y_(picture.height - 1) {
+    const Eigen::AlignedBox2d part = shown.intersection({Eigen::Vector2d::Zero(), Eigen::Vector2d(last_x_, last_y_)});
+    if (part.isEmpty()) return;
+    // One more than needed, so that there is always a next one.
+    left_ = static_cast<int>(part.min().x()), top_ = static_cast<int>(part.min().y());
+    width_ = std::min(static_cast<int>(part.max().x()) + 2, picture.width) - left_;
+    const int height = std::min(static_cast<int>(part.max().y()) + 2, picture.height) - top_;
+    values_.reserve(static_cast<size_t>(width_) * static_cast<size_t>(height));
+    for (int y = top_; y < top_ + height; ++y)
+      for (int x = left_; x < left_ + width_; ++x) values_.push_back(value(picture, x, y));
+  }
+
+  /// Linear between four pixels; 0 outside the picture and at no place.
+  /// @param at  within what the view shows
+  float operator()(const Eigen::Vector2d& at) const {
+    if (!(at.x() >= 0 && at.y() >= 0 && at.x() <= last_x_ && at.y() <= last_y_)) return 0;
+    const int x = std::min(static_cast<int>(at.x()), last_x_ - 1), y = std::min(static_cast<int>(at.y()), last_y_ - 1);
+    const auto fx = static_cast<float>(at.x() - x), fy = static_cast<float>(at.y() - y);
+    const float* upper =
+        &values_[static_cast<size_t>(y - top_) * static_cast<size_t>(width_) + static_cast<size_t>(x - left_)];
+    const float* lower = upper + width_;
+    return (1 - fy) * ((1 - fx) * upper[0] + fx * upper[1]) + fy * ((1 - fx) * lower[0] + fx * lower[1]);
+  }
+
+ private:
+  int last_x_, last_y_, left_ = 0, top_ = 0, width_ = 0;
+  std::vector<float> values_;
 };
 
 /// Samples a value of the picture at every pixel of the view, averaged where the picture is finer.
@@ -107,12 +139,13 @@ void render(const CalibratedView& camera, const Image& picture, const Calibrated
   const int samples =
       static_cast<int>(std::clamp(std::ceil((*aside - *middle).norm() - 0.25), 1.0, double{most_samples}));
   const PixelMap in_picture(camera, view);
+  const PictureValues values(picture, in_picture.extent(), value);
   for (int y = 0; y < view.intrinsics.height; ++y)
     for (int x = 0; x < view.intrinsics.width; ++x) {
       float sum = 0;
       for (int i = 0; i < samples * samples; ++i) {
         const double across = (i % samples + 0.5) / samples - 0.5, down = (i / samples + 0.5) / samples - 0.5;
-        sum += sample(picture, in_picture(x + across, y + down), value);
+        sum += values(in_picture(x + across, y + down));
       }
       put(x, y, sum / static_cast<float>(samples * samples));
     }

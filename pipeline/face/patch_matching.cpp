@@ -16,20 +16,24 @@ using Patch = Eigen::Array<float, side * side, 1>;
 std::optional<Patch> look_at(const PinholePicture& picture, const Eigen::Vector3d& middle, const Eigen::Vector3d& right,
                              const Eigen::Vector3d& down) {
   const Intrinsics& k = picture.view.intrinsics;
-  const Eigen::Vector3d at = picture.view.camera_from_world * middle;
-  const Eigen::Vector3d across = picture.view.camera_from_world.linear() * right;
-  const Eigen::Vector3d along = picture.view.camera_from_world.linear() * down;
+  const Eigen::Vector3f at = (picture.view.camera_from_world * middle).cast<float>();
+  const Eigen::Vector3f across = (picture.view.camera_from_world.linear() * right).cast<float>();
+  const Eigen::Vector3f along = (picture.view.camera_from_world.linear() * down).cast<float>();
+  const auto fx = static_cast<float>(k.fx), fy = static_cast<float>(k.fy), cx = static_cast<float>(k.cx),
+             cy = static_cast<float>(k.cy);
+  const auto last_x = static_cast<float>(picture.grey.width - 1), last_y = static_cast<float>(picture.grey.height - 1);
   Patch patch;
   for (int j = 0; j < side; ++j)
     for (int i = 0; i < side; ++i) {
-      const Eigen::Vector3d p = at + (2.0 * i / (side - 1) - 1) * across + (2.0 * j / (side - 1) - 1) * along;
-      const double x = k.fx * p.x() / p.z() + k.cx, y = k.fy * p.y() / p.z() + k.cy;
-      if (!(p.z() > 0 && x >= 0 && y >= 0 && x < picture.grey.width - 1 && y < picture.grey.height - 1))
-        return std::nullopt;
+      constexpr float half = (side - 1) / 2;
+      const Eigen::Vector3f p =
+          at + (static_cast<float>(i) / half - 1) * across + (static_cast<float>(j) / half - 1) * along;
+      const float per_depth = 1 / p.z(), x = fx * p.x() * per_depth + cx, y = fy * p.y() * per_depth + cy;
+      if (!(p.z() > 0 && x >= 0 && y >= 0 && x < last_x && y < last_y)) return std::nullopt;
       const int left = static_cast<int>(x), top = static_cast<int>(y);
-      const auto u = static_cast<float>(x - left), v = static_cast<float>(y - top);
+      const float u = x - static_cast<float>(left), v = y - static_cast<float>(top);
       const uint8_t* upper = picture.grey.pixel(left, top);
-      const uint8_t* lower = picture.grey.pixel(left, top + 1);
+      const uint8_t* lower = upper + picture.grey.width;
       patch[j * side + i] = (1 - v) * ((1 - u) * upper[0] + u * upper[1]) + v * ((1 - u) * lower[0] + u * lower[1]);
     }
   patch -= patch.mean();

@@ -1,7 +1,9 @@
 #include "pipeline/face/surface_matching.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
+#include <limits>
 #include <numeric>
 #include <optional>
 
@@ -138,78 +140,146 @@ SweptView sweep(const FacePicture& face, const SurfaceGrid& grid, const Mesh& su
   return view;
 }
 
-/// Sums over square windows that are made of blocks: as many to each side of every corner that four blocks share.
-class WindowSums {
+/// Sums of one view's values, of another's, of their squares and of their product, where both see the surface.
+enum Moment : size_t { of_a, of_b, of_aa, of_bb, of_ab, moments };
+
+/// Adds a row of samples to a line for each moment.
+void add_moments(const float* __restrict a, const float* __restrict b, const float* __restrict both, size_t count,
+                 float* __restrict line_a, float* __restrict line_b, float* __restrict line_aa,
+                 float* __restrict line_bb, float* __restrict line_ab) {
+  for (size_t x = 0; x < count; ++x) {
+    const float va = a[x] * both[x], vb = b[x] * both[x];
+    line_a[x] += va;
+    line_b[x] += vb;
+    line_aa[x] += va * va;
+    line_bb[x] += vb * vb;
+    line_ab[x] += va * vb;
+  }
+}
+
+/// The square windows of a grid, made of blocks: as many to each side of every corner that four blocks share.
+class WindowGrid {
  public:
   /// @param block  samples of a block, across and down
   /// @param reach  blocks from a window's middle to its rim
-  WindowSums(int width, int height, int block, int reach)
-      : width_(width), block_(block), reach_(reach), columns_(width / block), rows_(height / block) {
-    blocks_.resize(static_cast<size_t>(columns_) * static_cast<size_t>(rows_));
-    line_.resize(static_cast<size_t>(width));
-  }
+  WindowGrid(int width, int height, int block, int reach)
+      : width_(width), block_(block), reach_(reach), columns_(width / block), rows_(height / block) {}
   /// A window for every block, whose first sample is its middle.
   int columns() const { return columns_; }
   int rows() const { return rows_; }
+  int block() const { return block_; }
+  int width() const { return width_; }
+  int reach() const { return reach_; }
+  size_t size() const { return static_cast<size_t>(columns_) * static_cast<size_t>(rows_); }
   float samples() const { return static_cast<float>(4 * reach_ * reach_ * block_ * block_); }
-
-  template <class Value>
-  void sum(Value&& value, std::vector<float>* sums) {
-    for (int row = 0; row < rows_; ++row) {
-      std::fill(line_.begin(), line_.end(), 0.0F);
-      for (int y = row * block_; y < (row + 1) * block_; ++y) {
-        const size_t begin = static_cast<size_t>(y) * static_cast<size_t>(width_);
-        for (size_t x = 0; x < line_.size(); ++x) line_[x] += value(begin + x);
-      }
-      for (int column = 0; column < columns_; ++column) {
-        const auto first = line_.begin() + column * block_;
-        blocks_[index(column, row)] = std::accumulate(first, first + block_, 0.0F);
-      }
-    }
-    sums->assign(blocks_.size(), 0);
-    for (int row = reach_; row + reach_ <= rows_; ++row)
-      for (int column = reach_; column + reach_ <= columns_; ++column) {
-        float whole = 0;
-        for (int y = row - reach_; y < row + reach_; ++y)
-          for (int x = column - reach_; x < column + reach_; ++x) whole += blocks_[index(x, y)];
-        (*sums)[index(column, row)] = whole;
-      }
-  }
-
- private:
   size_t index(int column, int row) const {
     return static_cast<size_t>(row) * static_cast<size_t>(columns_) + static_cast<size_t>(column);
   }
+  size_t sample(int column, int row) const {
+    return static_cast<size_t>(row * block_) * static_cast<size_t>(width_) + static_cast<size_t>(column * block_);
+  }
+
+  /// The sum over a window of what its blocks hold.
+  float sum(const std::vector<float>& blocks, int column, int row) const {
+    float whole = 0;
+    for (int y = row - reach_; y < row + reach_; ++y)
+      for (int x = column - reach_; x < column + reach_; ++x) whole += blocks[index(x, y)];
+    return whole;
+  }
+
+ private:
   int width_, block_, reach_, columns_, rows_;
-  std::vector<float> blocks_, line_;
 };
 
-/// Correlations of two views, per step and window; nothing in a window: below −1.
-constexpr float no_correlation = -2;
-std::vector<std::vector<float>> correlate(const SweptView& a, const SweptView& b, size_t channel, WindowSums windows) {
-  std::vector<float> count, of_a, of_b, of_aa, of_bb, of_ab;
-  windows.sum([&](size_t i) { return a.visible[i] * b.visible[i]; }, &count);
-  std::vector<std::vector<float>> correlations(a.shades[channel].size());
-  for (size_t s = 0; s < correlations.size(); ++s) {
-    const float *pa = a.shades[channel][s].data(), *pb = b.shades[channel][s].data(), *va = a.visible.data(),
-                *vb = b.visible.data();
-    windows.sum([=](size_t i) { return pa[i] * vb[i]; }, &of_a);
-    windows.sum([=](size_t i) { return pb[i] * va[i]; }, &of_b);
-    windows.sum([=](size_t i) { return pa[i] * pa[i] * vb[i]; }, &of_aa);
-    windows.sum([=](size_t i) { return pb[i] * pb[i] * va[i]; }, &of_bb);
-    windows.sum([=](size_t i) { return pa[i] * pb[i]; }, &of_ab);
-    correlations[s].assign(count.size(), no_correlation);
-    for (size_t i = 0; i < count.size(); ++i) {
-      constexpr float enough = 0.6F, least_contrast = 2;  // of the window; grey levels
-      if (count[i] < enough * windows.samples()) continue;
-      const float n = count[i], mean_a = of_a[i] / n, mean_b = of_b[i] / n;
-      const float var_a = of_aa[i] / n - mean_a * mean_a, var_b = of_bb[i] / n - mean_b * mean_b;
-      if (!(std::min(var_a, var_b) > least_contrast * least_contrast)) continue;
-      correlations[s][i] = (of_ab[i] / n - mean_a * mean_b) / std::sqrt(var_a * var_b);
+/// Compares two views, window by window, where enough of a window is seen by both.
+class Comparison {
+ public:
+  Comparison(const SweptView& a, const SweptView& b, const WindowGrid& windows)
+      : a_(a), b_(b), windows_(windows), both_(a.visible.size()), spans_(static_cast<size_t>(windows.rows())) {
+    for (size_t i = 0; i < both_.size(); ++i) both_[i] = a.visible[i] * b.visible[i];
+    std::vector<float> blocks(windows_.size());
+    for (int row = 0; row < windows_.rows(); ++row)
+      for (int column = 0; column < windows_.columns(); ++column) {
+        float& count = blocks[windows_.index(column, row)];
+        for (int y = 0; y < windows_.block(); ++y) {
+          const auto first = both_.begin() + static_cast<std::ptrdiff_t>(windows_.sample(column, row)) +
+                             static_cast<std::ptrdiff_t>(y) * windows_.width();
+          count = std::accumulate(first, first + windows_.block(), count);
+        }
+      }
+    for (int row = windows_.reach(); row + windows_.reach() <= windows_.rows(); ++row)
+      for (int column = windows_.reach(); column + windows_.reach() <= windows_.columns(); ++column) {
+        constexpr float enough = 0.6F;
+        const float count = windows_.sum(blocks, column, row);
+        if (count < enough * windows_.samples()) continue;
+        compared_.push_back({column, row, count});
+        for (int y = row - windows_.reach(); y < row + windows_.reach(); ++y) {
+          Span& span = spans_[static_cast<size_t>(y)];
+          span.begin = std::min(span.begin, column - windows_.reach());
+          span.end = std::max(span.end, column + windows_.reach());
+        }
+      }
+  }
+
+  /// Correlations per step and window.
+  std::vector<std::vector<float>> correlate(size_t channel) const {
+    std::vector<std::vector<float>> correlations(a_.shades[channel].size());
+    std::array<std::vector<float>, moments> blocks, lines;
+    for (auto& of : blocks) of.assign(windows_.size(), 0);
+    for (auto& of : lines) of.resize(static_cast<size_t>(windows_.width()));
+    for (size_t s = 0; s < correlations.size(); ++s) {
+      sum_blocks(a_.shades[channel][s].data(), b_.shades[channel][s].data(), &lines, &blocks);
+      correlations[s].assign(windows_.size(), no_correlation);
+      for (const auto& [column, row, n] : compared_) {
+        std::array<float, moments> mean{};
+        for (size_t m = 0; m < moments; ++m) mean[m] = windows_.sum(blocks[m], column, row) / n;
+        constexpr float least_contrast = 2;  // of the window; grey levels
+        const float var_a = mean[of_aa] - mean[of_a] * mean[of_a], var_b = mean[of_bb] - mean[of_b] * mean[of_b];
+        if (std::min(var_a, var_b) > least_contrast * least_contrast)
+          correlations[s][windows_.index(column, row)] =
+              (mean[of_ab] - mean[of_a] * mean[of_b]) / std::sqrt(var_a * var_b);
+      }
+    }
+    return correlations;
+  }
+
+  static constexpr float no_correlation = -2;  ///< of windows without: below −1
+
+ private:
+  struct Window {
+    int column, row;
+    float count;  ///< samples that both see
+  };
+  struct Span {
+    int begin = std::numeric_limits<int>::max(), end = 0;  ///< columns of blocks that windows are made of
+  };
+
+  void sum_blocks(const float* a, const float* b, std::array<std::vector<float>, moments>* lines,
+                  std::array<std::vector<float>, moments>* blocks) const {
+    for (int row = 0; row < windows_.rows(); ++row) {
+      const auto [begin, end] = spans_[static_cast<size_t>(row)];
+      if (begin >= end) continue;
+      for (auto& line : *lines) std::fill(line.begin(), line.end(), 0.0F);
+      for (int y = 0; y < windows_.block(); ++y) {
+        const size_t at = windows_.sample(begin, row) + static_cast<size_t>(y) * static_cast<size_t>(windows_.width());
+        add_moments(a + at, b + at, both_.data() + at, static_cast<size_t>((end - begin) * windows_.block()),
+                    (*lines)[of_a].data(), (*lines)[of_b].data(), (*lines)[of_aa].data(), (*lines)[of_bb].data(),
+                    (*lines)[of_ab].data());
+      }
+      for (size_t m = 0; m < moments; ++m)
+        for (int column = begin; column < end; ++column) {
+          const auto first = (*lines)[m].begin() + (column - begin) * windows_.block();
+          (*blocks)[m][windows_.index(column, row)] = std::accumulate(first, first + windows_.block(), 0.0F);
+        }
     }
   }
-  return correlations;
-}
+
+  const SweptView &a_, &b_;
+  const WindowGrid& windows_;
+  std::vector<float> both_;
+  std::vector<Span> spans_;  ///< per row of blocks
+  std::vector<Window> compared_;
+};
 
 /// The best step, between steps; nothing where it is not clear.
 struct Peak {
@@ -276,11 +346,13 @@ std::vector<SurfaceMatch> match_surface(std::span<const FacePicture> pictures, c
       constexpr double closest = 0.99, farthest = 0.47;  // cos 8°: no depth; cos 62°: skin looks too different
       if (to_a.dot(to_b) < closest && to_a.dot(to_b) > farthest) pairs.push_back({a, b});
     }
-  const WindowSums windows(grid.width, grid.height, block, reach);
+  const WindowGrid windows(grid.width, grid.height, block, reach);
   std::vector<std::vector<std::vector<float>>> correlations(2 * pairs.size());
-  work.parallel_for(correlations.size(), 1, [&](size_t begin, size_t end) {
-    for (size_t i = begin; i < end && !work.stopped(); ++i)
-      correlations[i] = correlate(views[pairs[i / 2][0]], views[pairs[i / 2][1]], i % 2, windows);
+  work.parallel_for(pairs.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end && !work.stopped(); ++i) {
+      const Comparison comparison(views[pairs[i][0]], views[pairs[i][1]], windows);
+      for (size_t channel = 0; channel < 2; ++channel) correlations[2 * i + channel] = comparison.correlate(channel);
+    }
   });
   if (work.stopped()) return matches;
 
@@ -294,10 +366,9 @@ std::vector<SurfaceMatch> match_surface(std::span<const FacePicture> pictures, c
   std::vector<double> likelihood(static_cast<size_t>(2 * steps + 1)), correlation(likelihood.size());
   for (int row = 0; row < windows.rows(); ++row)
     for (int column = 0; column < windows.columns(); ++column) {
-      const size_t i =
-          static_cast<size_t>(row * block) * static_cast<size_t>(grid.width) + static_cast<size_t>(column * block);
+      const size_t i = windows.sample(column, row);
       if (grid.known[i] == 0) continue;
-      const size_t w = static_cast<size_t>(row) * static_cast<size_t>(windows.columns()) + static_cast<size_t>(column);
+      const size_t w = windows.index(column, row);
       std::fill(likelihood.begin(), likelihood.end(), 0.0);
       std::fill(correlation.begin(), correlation.end(), 0.0);
       int seen = 0;
