@@ -385,6 +385,7 @@ void visit_export(Visitor& visitor, AvatarFileOptions& files) {
   visitor.choice("texture", files.texture, Words<ImageFormat>{{"png", ImageFormat::png}, {"jpeg", ImageFormat::jpeg}});
   visitor.integer("jpeg_quality", files.jpeg_quality, 1, 100);
   visitor.boolean("animation", files.animation);
+  visitor.boolean("collada_morphs", files.collada_morphs);
   visitor.boolean("turntable", files.turntable);
   visitor.choices("formats", files.formats,
                   Words<MeshFormat>{{"stl", MeshFormat::stl}, {"obj", MeshFormat::obj}, {"ply", MeshFormat::ply}});

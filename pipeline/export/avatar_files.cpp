@@ -62,8 +62,11 @@ std::vector<NamedBytes> make_avatar_files(const Avatar& avatar, AvatarMetadata m
                   }});
   plan.push_back({"preview.png", [&] { return encode_png(render_portrait(avatar, options.portrait)); }});
   plan.push_back({"avatar.dae", [&] {
-                    return to_bytes(write_collada(
-                        avatar, clips, {.texture_file = texture, .created = metadata.created, .authoring_tool = tool}));
+                    return to_bytes(write_collada(avatar, clips,
+                                                  {.texture_file = texture,
+                                                   .created = metadata.created,
+                                                   .authoring_tool = tool,
+                                                   .morphs = options.collada_morphs}));
                   }});
   plan_mesh_files(avatar, options.formats, texture, plan);
 

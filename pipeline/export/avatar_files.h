@@ -23,6 +23,7 @@ struct AvatarFileOptions {
   int texture_png_level = 1;               ///< zlib's, 0 … 9: 6 makes a file 8 % smaller, in four times the time
   int jpeg_quality = 92;                   ///< 1 … 100
   bool animation = false;                  ///< two clips in avatar.dae and avatar.glb, see make_clips
+  bool collada_morphs = false;             ///< facial expressions in avatar.dae too, see write_collada
   bool turntable = false;                  ///< turntable.webp besides
   std::vector<MeshFormat> formats;         ///< avatar.stl, avatar.obj with avatar.mtl, avatar.ply besides
   PortraitOptions portrait;

@@ -61,6 +61,24 @@ constexpr std::string_view geometry_id = "avatar-mesh", controller_id = "avatar-
                            effect_id = "avatar-effect", image_id = "avatar-texture", scene_id = "avatar-scene",
                            node_id = "avatar";
 
+/// What may stand in an XML name after its first letter.
+std::string name_characters(std::string_view text) {
+  std::string name;
+  for (const char c : text) name += is_letter_or_digit(c) || c == '-' || c == '.' ? c : '_';
+  return name;
+}
+
+/// The name with a number behind it where it is taken; then it is, too.
+std::string unique_id(const std::string& name, std::set<std::string>& taken) {
+  std::string id = name;
+  for (int copy = 2; !taken.insert(id).second; ++copy) {
+    id = name;
+    id += '_';
+    id += std::to_string(copy);
+  }
+  return id;
+}
+
 /// An id for every joint: its name, made an XML name where it is none, and unique in the document.
 std::vector<std::string> joint_ids(const Skeleton& skeleton) {
   std::set<std::string> taken;
@@ -69,15 +87,18 @@ std::vector<std::string> joint_ids(const Skeleton& skeleton) {
     const char first = joint.name.front();
     const bool usable = (is_letter(first) || first == '_') && !joint.name.starts_with(own_prefix);
     std::string name(usable ? "" : "_");
-    for (const char c : joint.name) name += is_letter_or_digit(c) || c == '-' || c == '.' ? c : '_';
-    std::string id = name;
-    for (int copy = 2; !taken.insert(id).second; ++copy) {
-      id = name;
-      id += '_';
-      id += std::to_string(copy);
-    }
-    ids.push_back(id);
+    name += name_characters(joint.name);
+    ids.push_back(unique_id(name, taken));
   }
+  return ids;
+}
+
+/// An id for the shape of every morph target.
+std::vector<std::string> shape_ids(std::span<const MorphTarget> morphs) {
+  std::set<std::string> taken;
+  std::vector<std::string> ids;
+  for (const MorphTarget& morph : morphs)
+    ids.push_back(unique_id("avatar-shape-" + name_characters(morph.name), taken));
   return ids;
 }
 
@@ -134,7 +155,7 @@ void write_material(NumberText& out, const ColladaOptions& options) {
 void write_geometry(NumberText& out, const Avatar& avatar) {
   const SeamVertices split = split_at_seams(avatar);
   const std::vector<Eigen::Vector3f> normals = unit_normals(avatar.mesh);
-  out << "  <library_geometries>\n    <geometry id=\"" << geometry_id << "\" name=\"" << geometry_id << "\"><mesh>\n";
+  out << "    <geometry id=\"" << geometry_id << "\" name=\"" << geometry_id << "\"><mesh>\n";
   write_source(out, "avatar-positions", avatar.mesh.positions.size(), "XYZ", [&] {
     for (const Eigen::Vector3f& p : avatar.mesh.positions) out << p.x() << ' ' << p.y() << ' ' << p.z() << '\n';
   });
@@ -158,7 +179,32 @@ void write_geometry(NumberText& out, const Avatar& avatar) {
       out << vertex << ' ' << vertex << ' ' << split.triangles[t][corner] << (corner < 2 ? ' ' : '\n');
     }
   }
-  out << "</p>\n      </triangles>\n    </mesh></geometry>\n  </library_geometries>\n";
+  out << "</p>\n      </triangles>\n    </mesh></geometry>\n";
+}
+
+/// What the mesh becomes where a morph target has its whole weight. Without triangles readers refuse it.
+void write_shape(NumberText& out, const Mesh& mesh, const MorphTarget& morph, const std::string& id) {
+  out << "    <geometry id=\"" << id << "\" name=\"" << escaped(morph.name) << "\"><mesh>\n";
+  write_source(out, id + "-positions", mesh.positions.size(), "XYZ", [&] {
+    size_t next = 0;
+    for (size_t v = 0; v < mesh.positions.size(); ++v) {
+      Eigen::Vector3f p = mesh.positions[v];
+      if (next < morph.vertices.size() && morph.vertices[next] == v) p += morph.offsets[next++];
+      out << p.x() << ' ' << p.y() << ' ' << p.z() << '\n';
+    }
+  });
+  out << "      <vertices id=\"" << id << "-vertices\"><input semantic=\"POSITION\" source=\"#" << id
+      << "-positions\"/></vertices>\n      <triangles count=\"" << mesh.triangles.size()
+      << "\"><input semantic=\"VERTEX\" source=\"#" << id << "-vertices\" offset=\"0\"/>\n        <p>";
+  for (const auto& triangle : mesh.triangles) out << triangle[0] << ' ' << triangle[1] << ' ' << triangle[2] << '\n';
+  out << "</p>\n      </triangles>\n    </mesh></geometry>\n";
+}
+
+void write_geometries(NumberText& out, const Avatar& avatar, std::span<const std::string> shapes) {
+  out << "  <library_geometries>\n";
+  write_geometry(out, avatar);
+  for (size_t i = 0; i < shapes.size(); ++i) write_shape(out, avatar.mesh, avatar.morphs[i], shapes[i]);
+  out << "  </library_geometries>\n";
 }
 
 /// Row by row, as COLLADA has matrices.
@@ -208,10 +254,10 @@ void write_vertex_weights(NumberText& out, const SkinTables& tables) {
   out << "</v>\n      </vertex_weights>\n";
 }
 
-void write_controller(NumberText& out, const Avatar& avatar, const std::vector<std::string>& ids) {
+void write_skin(NumberText& out, const Avatar& avatar, const std::vector<std::string>& ids) {
   const SkinTables tables = make_skin_tables(avatar);
-  out << "  <library_controllers>\n    <controller id=\"" << controller_id << "\" name=\"" << controller_id
-      << "\"><skin source=\"#" << geometry_id << "\">\n"
+  out << "    <controller id=\"" << controller_id << "\" name=\"" << controller_id << "\"><skin source=\"#"
+      << geometry_id << "\">\n"
       << "      <bind_shape_matrix>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</bind_shape_matrix>\n"
       << "      <source id=\"avatar-joints\">\n        <Name_array id=\"avatar-joints-array\" count=\"" << ids.size()
       << "\">";
@@ -225,7 +271,38 @@ void write_controller(NumberText& out, const Avatar& avatar, const std::vector<s
       << ids.size() << "\" stride=\"16\"><param name=\"TRANSFORM\" type=\"float4x4\"/></accessor></technique_common>\n"
       << "      </source>\n";
   write_vertex_weights(out, tables);
-  out << "    </skin></controller>\n  </library_controllers>\n";
+  out << "    </skin></controller>\n";
+}
+
+/// The shapes about the mesh, all at rest.
+void write_morph(NumberText& out, std::span<const std::string> shapes) {
+  out << "    <controller id=\"avatar-morph\" name=\"avatar-morph\"><morph source=\"#" << geometry_id
+      << "\" method=\"NORMALIZED\">\n      <source id=\"avatar-morph-targets\">\n        <IDREF_array "
+         "id=\"avatar-morph-targets-array\" count=\""
+      << shapes.size() << "\">";
+  for (size_t i = 0; i < shapes.size(); ++i) out << shapes[i] << (i + 1 < shapes.size() ? " " : "");
+  out << "</IDREF_array>\n        <technique_common><accessor source=\"#avatar-morph-targets-array\" count=\""
+      << shapes.size()
+      << "\" stride=\"1\"><param name=\"MORPH_TARGET\" type=\"IDREF\"/></accessor></technique_common>\n      "
+         "</source>\n      <source id=\"avatar-morph-weights\">\n        <float_array "
+         "id=\"avatar-morph-weights-array\" count=\""
+      << shapes.size() << "\">";
+  for (size_t i = 0; i < shapes.size(); ++i) out << (i == 0 ? "0" : " 0");
+  out << "</float_array>\n        <technique_common><accessor source=\"#avatar-morph-weights-array\" count=\""
+      << shapes.size()
+      << "\" stride=\"1\"><param name=\"MORPH_WEIGHT\" type=\"float\"/></accessor></technique_common>\n      "
+         "</source>\n      <targets><input semantic=\"MORPH_TARGET\" source=\"#avatar-morph-targets\"/>"
+         "<input semantic=\"MORPH_WEIGHT\" source=\"#avatar-morph-weights\"/></targets>\n    "
+         "</morph></controller>\n";
+}
+
+void write_controllers(NumberText& out, const Avatar& avatar, const std::vector<std::string>& ids,
+                       std::span<const std::string> shapes) {
+  if (ids.empty() && shapes.empty()) return;
+  out << "  <library_controllers>\n";
+  if (!ids.empty()) write_skin(out, avatar, ids);
+  if (!shapes.empty()) write_morph(out, shapes);
+  out << "  </library_controllers>\n";
 }
 
 /// The clips as one timeline: the matrix of every moving joint, key by key.
@@ -314,13 +391,14 @@ void write_scene(NumberText& out, const Skeleton& skeleton, const std::vector<st
 
 std::string write_collada(const Avatar& avatar, std::span<const AnimationClip> clips, const ColladaOptions& options) {
   const std::vector<std::string> ids = joint_ids(avatar.skeleton);
+  const std::vector<std::string> shapes = options.morphs ? shape_ids(avatar.morphs) : std::vector<std::string>();
   NumberText out;
   constexpr size_t vertex_bytes = 130, triangle_bytes = 60;  // a little more than they take, to grow only once
   out.reserve(avatar.mesh.positions.size() * vertex_bytes + avatar.mesh.triangles.size() * triangle_bytes);
   write_header(out, options);
   write_material(out, options);
-  write_geometry(out, avatar);
-  if (!ids.empty()) write_controller(out, avatar, ids);
+  write_geometries(out, avatar, shapes);
+  write_controllers(out, avatar, ids, shapes);
   if (!clips.empty()) write_animation(out, clips, ids);
   write_scene(out, avatar.skeleton, ids);
   return out.take();

@@ -59,6 +59,26 @@ def check_look(mesh_object, folder):
     assert min(heights) > -0.1 and max(heights) - min(heights) > 0.5, "does not stand on the floor"
 
 
+def check_shapes(mesh_object, path):
+    """The file's morph targets are shape keys: named alike, of the same positions."""
+    root = ElementTree.parse(path).getroot()
+    targets = root.findtext(".//{*}morph/{*}source/{*}IDREF_array", "").split()
+    keys = mesh_object.data.shape_keys
+    if not targets:
+        assert keys is None, "shape keys from nowhere"
+        return
+    blocks = {block.name: block for block in keys.key_blocks}
+    for target in targets:
+        geometry = root.find(".//{*}geometry[@id='%s']" % target)
+        numbers = [float(word) for word in geometry.findtext(".//{*}float_array").split()]
+        block = blocks[geometry.get("name")]
+        assert len(numbers) == 3 * len(block.data), target
+        for i, point in enumerate(block.data):
+            assert (point.co - mathutils.Vector(numbers[3 * i:3 * i + 3])).length < NEAR_M, (target, i)
+    assert len(blocks) == len(targets) + 1, sorted(blocks)
+    print("%d shape keys" % len(targets))
+
+
 def check_pose(armature, mesh_object, joints):
     """Turns one bone after another; what is weighted to it and its family moves rigidly or blended, all else stays."""
     group_names = [group.name for group in mesh_object.vertex_groups]
@@ -89,6 +109,7 @@ def main():
     assert bpy.ops.wm.collada_import(filepath=path) == {"FINISHED"}
     meshes = [o for o in bpy.data.objects if o.type == "MESH"]
     assert len(meshes) == 1, "%d meshes" % len(meshes)
+    check_shapes(meshes[0], path)
     check_look(meshes[0], os.path.dirname(os.path.abspath(path)))
     armatures = [o for o in bpy.data.objects if o.type == "ARMATURE"]
     if not joints:

@@ -124,12 +124,20 @@ TEST(AvatarFiles, AreTheSameWithAnyNumberOfThreads) {
 }
 
 /// Other people's readers find nothing wrong with it.
-class AvatarFolder : public testing::TestWithParam<bool> {};
+struct FolderCase {
+  const char* name;
+  bool rigged, morphs;
+};
+class AvatarFolder : public testing::TestWithParam<FolderCase> {};
 
 TEST_P(AvatarFolder, PassesTheAcceptanceChecks) {
   const TemporaryFolder folder;
-  const Avatar avatar = synthetic::make_avatar(synthetic::person(), {.rigged = GetParam()});
-  for (const NamedBytes& file : make_avatar_files(avatar, metadata(), {})) {
+  Avatar avatar = synthetic::make_avatar(synthetic::person(), {.rigged = GetParam().rigged});
+  AvatarFileOptions options;
+  options.collada_morphs = GetParam().morphs;
+  if (GetParam().morphs)
+    avatar.morphs = {{"smile", {3, 7, 20}, {{0.01F, 0, 0}, {0, 0.02F, 0}, {0, 0, -0.03F}}}, {"nothing", {}, {}}};
+  for (const NamedBytes& file : make_avatar_files(avatar, metadata(), options)) {
     std::ofstream out(folder.path() / file.name, std::ios::binary);
     out.write(reinterpret_cast<const char*>(file.bytes.data()), static_cast<std::streamsize>(file.bytes.size()));
     ASSERT_TRUE(out.flush());
@@ -144,8 +152,11 @@ TEST_P(AvatarFolder, PassesTheAcceptanceChecks) {
   EXPECT_EQ(WEXITSTATUS(status), 0);
 }
 
-INSTANTIATE_TEST_SUITE_P(RiggedOrNot, AvatarFolder, testing::Bool(),
-                         [](const auto& instance) { return instance.param ? "Rigged" : "Unrigged"; });
+INSTANTIATE_TEST_SUITE_P(All, AvatarFolder,
+                         testing::Values(FolderCase{"Rigged", true, false}, FolderCase{"Unrigged", false, false},
+                                         FolderCase{"RiggedWithMorphs", true, true},
+                                         FolderCase{"UnriggedWithMorphs", false, true}),
+                         [](const auto& instance) { return instance.param.name; });
 
 }  // namespace
 }  // namespace booth

@@ -128,6 +128,27 @@ TEST(Collada, OfAnUnriggedAvatarHasNoController) {
   EXPECT_THAT(collada, HasSubstr("<instance_geometry url=\"#avatar-mesh\">"));
 }
 
+TEST(Collada, HoldsMorphTargetsWhereAskedFor) {
+  Avatar avatar = synthetic::make_avatar(synthetic::person());
+  avatar.morphs = {{"smile", {3, 7}, {{0.25F, 0, 0}, {0, -0.5F, 0}}}, {"a wink", {}, {}}, {"a&wink", {}, {}}};
+  EXPECT_THAT(write_collada(avatar, {}, {}), Not(HasSubstr("morph")));
+
+  const std::string collada = write_collada(avatar, {}, {.morphs = true});
+  EXPECT_THAT(collada, HasSubstr(">avatar-shape-smile avatar-shape-a_wink avatar-shape-a_wink_2</IDREF_array>"));
+  EXPECT_THAT(collada, HasSubstr("<geometry id=\"avatar-shape-a_wink_2\" name=\"a&amp;wink\">"));
+  EXPECT_THAT(collada, HasSubstr("<morph source=\"#avatar-mesh\" method=\"NORMALIZED\">"));
+  EXPECT_THAT(collada, HasSubstr("<skin source=\"#avatar-mesh\">"));
+  EXPECT_THAT(array(collada, "avatar-morph-weights"), testing::Each(0));
+  EXPECT_EQ(array(collada, "avatar-shape-a_wink-positions"), array(collada, "avatar-positions"));
+  std::vector<Eigen::Vector3f> moved = avatar.mesh.positions;
+  moved[3].x() += 0.25F;
+  moved[7].y() -= 0.5F;
+  const std::vector<float> written = array(collada, "avatar-shape-smile-positions");
+  ASSERT_EQ(written.size(), moved.size() * 3);
+  for (size_t v = 0; v < moved.size(); ++v)
+    for (size_t axis = 0; axis < 3; ++axis) ASSERT_EQ(written[3 * v + axis], moved[v][static_cast<int>(axis)]);
+}
+
 TEST(Collada, WritesUnitNormalsWhereThereIsNoArea) {
   Avatar avatar;
   avatar.mesh.positions = {{0, 0, 0}, {1, 0, 0}, {2, 0, 0}};
