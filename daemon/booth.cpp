@@ -48,6 +48,14 @@ ErrorCode code_of(const std::string& kind) {
   return ErrorCode::device_lost;
 }
 
+/// Entries of a folder; 0 where it cannot be listed.
+uint64_t count_entries(const char* folder) {
+  std::error_code code;
+  uint64_t count = 0;
+  for (fs::directory_iterator entry(folder, code), end; !code && entry != end; entry.increment(code)) ++count;
+  return count;
+}
+
 /// Of this process; 0 where the system does not say.
 double resident_bytes() {
   std::ifstream file("/proc/self/statm");
@@ -113,6 +121,8 @@ Booth::~Booth() {
   // What was asked of the desk and still waits for the disk comes first.
   std::promise<void> carried_out;
   if (disk_executor_.post([&carried_out] { carried_out.set_value(); })) carried_out.get_future().wait();
+  if (history_ != nullptr)
+    if (const auto saved = history_->save(); !saved) spdlog::warn("{}", saved.error().message);
   calibration_desk_.reset();
   cameras_.reset();
   previews_.reset();
@@ -154,6 +164,7 @@ Result<void> Booth::open_stores() {
   auto backgrounds = BackgroundStore::open(booth.backgrounds());
   if (!backgrounds) return backgrounds.error();
   backgrounds_ = std::move(*backgrounds);
+  history_ = std::make_unique<HealthHistory>(health_history_file(booth.state_directory));
   return {};
 }
 
@@ -586,6 +597,43 @@ void Booth::tend_background() {
     spdlog::warn("the background is not learned again: {}", task.error().message);
 }
 
+void Booth::note_health() {
+  const auto measured = metrics_.snapshot();
+  const auto total = [&measured](const char* name) {
+    const auto found = measured.find(name);
+    return found == measured.end() ? 0 : found->second;
+  };
+  HealthObservation now{.time = std::chrono::system_clock::now(),
+                        .steady = SteadyClock::now(),
+                        .free_bytes = disk_guard_.free_bytes(),
+                        .used_bytes = disk_guard_.used_bytes(),
+                        .resident_bytes = static_cast<uint64_t>(resident_bytes()),
+                        .descriptors = count_entries("/proc/self/fd"),
+                        .threads = count_entries("/proc/self/task"),
+                        .totals = {.captures_done = total("captures_done"),
+                                   .captures_failed = total("captures_failed"),
+                                   .jobs_done = total("jobs_done"),
+                                   .jobs_failed = total("jobs_failed"),
+                                   .job_seconds = total("job_seconds_sum")}};
+  {
+    const std::lock_guard lock(state_mutex_);
+    now.ready = announced_ && announced_->empty();
+  }
+  for (const Job& job : jobs_->list())
+    if (job.state == JobState::queued || job.state == JobState::running) ++now.queued;
+  if (cameras_ != nullptr)
+    for (const CameraStatus& camera : cameras_->status())
+      now.cameras.push_back({.id = camera.id,
+                             .offline = camera.state == DeviceState::offline,
+                             .frames = camera.frames,
+                             .dropped = camera.dropped});
+  if (!history_->observe(now)) return;
+  // A full queue of the disk has more important things in it: the next time will do.
+  disk_executor_.post([this] {
+    if (const auto saved = history_->save(); !saved) spdlog::warn("{}", saved.error().message);
+  });
+}
+
 void Booth::keep_house(const std::stop_token& stop) {
   auto next_heartbeat = SteadyClock::now(), next_disk = next_heartbeat, next_sweep = next_heartbeat + first_sweep;
   bool disk_was_full = false;
@@ -605,6 +653,7 @@ void Booth::keep_house(const std::stop_token& stop) {
         if (!disk && !disk_was_full) events_.publish(Alert{Severity::error, "disk_full", disk.error().message});
         disk_was_full = !disk;
         tend_background();
+        note_health();
       }
       refresh();
       if (now >= next_heartbeat) {

@@ -22,6 +22,7 @@
 #include "daemon/disk_guard.h"
 #include "daemon/eraser.h"
 #include "daemon/event_bus.h"
+#include "daemon/health_history.h"
 #include "daemon/health_monitor.h"
 #include "daemon/job_queue.h"
 #include "daemon/job_runner.h"
@@ -129,6 +130,8 @@ class Booth {
 
   BoothStatus status() const;
   std::map<std::string, double> measurements() const;
+  /// How it has been, over restarts.
+  const HealthHistory& history() const { return *history_; }
 
   // Tasks: each returns its id at once, and `task` events tell how it goes.
   /// Every camera that the drivers see. @error busy, not_ready
@@ -198,6 +201,7 @@ class Booth {
   void keep_house(const std::stop_token& stop);
   std::optional<std::chrono::seconds> background_age() const;
   void tend_background();
+  void note_health();
 
   const BoothOptions options_;
   const Clock& clock_;
@@ -210,7 +214,8 @@ class Booth {
   std::unique_ptr<JobQueue> jobs_;
   std::unique_ptr<AvatarStore> avatars_;
   std::unique_ptr<CaptureJournal> journal_;
-  SerialExecutor disk_executor_;  ///< its tasks use the two above
+  std::unique_ptr<HealthHistory> history_;
+  SerialExecutor disk_executor_;  ///< its tasks use those above
   std::unique_ptr<BackgroundStore> backgrounds_;
   TaskBoard tasks_{events_};
   mutable std::mutex rig_mutex_;

@@ -22,6 +22,7 @@
 #include "daemon/boothctl/calibrate.h"
 #include "daemon/boothctl/command.h"
 #include "daemon/boothctl/doctor.h"
+#include "daemon/boothctl/history.h"
 #include "daemon/boothctl/keys.h"
 #include "daemon/boothctl/report.h"
 #include "daemon/boothctl/traces.h"
@@ -564,6 +565,7 @@ int main(int argc, char** argv) {
   };
   booth::add_report_command(app, connect, offline);
   booth::add_metrics_command(app, connect, options.json, offline);
+  booth::add_history_command(app, connect, options.json, offline);
   booth::add_keys_command(app, options.json, offline);
   booth::add_traces_command(app, options.json, offline);
   auto* projector = app.add_subcommand("projector", "what lights the face with patterns");

@@ -106,6 +106,7 @@ std::optional<Reply> Dispatcher::dispatch(Method method, const Json& params, con
     case Method::system_describe: respond(no_params([&] { return describe(); })); break;
     case Method::system_status: respond(no_params([&] { return status(); })); break;
     case Method::system_metrics: respond(no_params([&] { return metrics(); })); break;
+    case Method::system_history: respond(history(params)); break;
     case Method::system_shutdown: respond(no_params([&] { return shut_down_(), Answer(Reply{}); })); break;
     case Method::camera_discover: respond(no_params([&] { return task_answer(booth_.discover_cameras()); })); break;
     case Method::preview_start: respond(start_preview(params)); break;
@@ -189,6 +190,16 @@ Answer Dispatcher::status() const {
 }
 
 Answer Dispatcher::metrics() const { return Reply{booth_.measurements()}; }
+
+Answer Dispatcher::history(const Json& params) const {
+  const auto request = parse_system_history(params);
+  if (!request) return request.error();
+  const auto since = std::chrono::system_clock::now() - std::chrono::hours(request->hours);
+  Json samples = Json::array();
+  for (const HealthSample& sample : booth_.history().samples(since, request->limit))
+    samples.push_back(booth::to_json(sample));
+  return Reply{{{"samples", samples}}};
+}
 
 std::optional<Reply> Dispatcher::start_capture(const Json& params, const Responder& respond) {
   const auto request = parse_capture_start(params);

@@ -43,6 +43,7 @@ class Dispatcher {
   Answer describe() const;
   Answer status() const;
   Answer metrics() const;
+  Answer history(const nlohmann::json& params) const;
   Answer list_jobs(const nlohmann::json& params);
   Answer list_avatars(const nlohmann::json& params);
   std::optional<Reply> start_capture(const nlohmann::json& params, const Responder& respond);

@@ -11,6 +11,7 @@ enum class Method {
   system_describe,
   system_status,
   system_metrics,
+  system_history,
   system_shutdown,
   camera_discover,
   preview_start,
@@ -42,10 +43,11 @@ struct MethodEntry {
   bool changes;  ///< changes or starts something, and so takes a `key`
 };
 
-inline constexpr std::array<MethodEntry, 26> methods{{
+inline constexpr std::array<MethodEntry, 27> methods{{
     {Method::system_describe, "system.describe", false},
     {Method::system_status, "system.status", false},
     {Method::system_metrics, "system.metrics", false},
+    {Method::system_history, "system.history", false},
     {Method::system_shutdown, "system.shutdown", true},
     {Method::camera_discover, "camera.discover", true},
     {Method::preview_start, "preview.start", true},

@@ -98,6 +98,14 @@ class Reader {
 
 Result<NoParams> parse_no_params(const Json& params) { return Reader(params).finish(NoParams{}); }
 
+Result<SystemHistory> parse_system_history(const Json& params) {
+  Reader reader(params);
+  SystemHistory request;
+  if (const auto hours = reader.whole("hours", 1, 10000, "1 … 10000")) request.hours = static_cast<int>(*hours);
+  if (const auto limit = reader.whole("limit", 1, 500, "1 … 500")) request.limit = *limit;
+  return reader.finish(request);
+}
+
 Result<PreviewStart> parse_preview_start(const Json& params) {
   Reader reader(params);
   PreviewStart request;

@@ -15,6 +15,10 @@ namespace booth::api {
 constexpr uint64_t most_fetch_bytes = 8 * 1024 * 1024;
 
 struct NoParams {};
+struct SystemHistory {
+  int hours = 24;      ///< back from now
+  size_t limit = 100;  ///< samples
+};
 struct PreviewStart {
   std::string camera;
   PreviewSettings settings;
@@ -54,6 +58,7 @@ struct AvatarFetch {
 // From a JSON object, without `key`, to a request. @error invalid_argument  the member, its value and what would do;
 // a member that is missing or that nobody asked for
 Result<NoParams> parse_no_params(const nlohmann::json& params);
+Result<SystemHistory> parse_system_history(const nlohmann::json& params);
 Result<PreviewStart> parse_preview_start(const nlohmann::json& params);
 Result<BackgroundLearn> parse_background_learn(const nlohmann::json& params);
 Result<BoardRequest> parse_calibration_capture(const nlohmann::json& params);

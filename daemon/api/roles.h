@@ -34,7 +34,7 @@ constexpr std::optional<Role> role_from(std::string_view name) {
 /// A method that is not listed here is the operator's alone, so that a new one opens nothing to anybody.
 constexpr Role least_role(Method method) {
   constexpr std::array viewers{Method::system_describe, Method::system_status, Method::system_metrics,
-                               Method::job_list};
+                               Method::system_history, Method::job_list};
   constexpr std::array kiosks{Method::preview_start,  Method::preview_stop, Method::capture_start,
                               Method::capture_cancel, Method::job_cancel,   Method::job_retry,
                               Method::capture_delete, Method::avatar_list,  Method::avatar_get,

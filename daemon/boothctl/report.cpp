@@ -33,6 +33,8 @@ namespace fs = std::filesystem;
 using Json = nlohmann::json;
 
 constexpr size_t most_log_bytes = size_t{4} << 20;
+constexpr int most_history_hours = 10000;  ///< all that there is
+constexpr int most_history_samples = 500;
 
 /// Files by name, as a gzipped archive of tar (POSIX ustar).
 std::vector<uint8_t> pack(const std::map<std::string, std::string>& files) {
@@ -138,8 +140,8 @@ void make_report(const ReportOptions& options, const Connect& connect) {
   files["boothd.toml"] = config ? write_config(*config) : config.error().message + "\n";
 
   Json avatars = Json::array();
-  const auto ask = [&](api::Client& client, const char* method) {
-    const auto answer = client.call(method, Json::object());
+  const auto ask = [&](api::Client& client, const char* method, const Json& params = Json::object()) {
+    const auto answer = client.call(method, params);
     if (const auto* error = std::get_if<api::CallError>(&answer)) return Json{{"error", error->message}};
     return std::get<api::CallReply>(answer).result;
   };
@@ -148,6 +150,8 @@ void make_report(const ReportOptions& options, const Connect& connect) {
   files["status.json"] = status.dump(2, ' ', false, Json::error_handler_t::replace) + "\n";
   if (!status.contains("error")) {
     files["metrics.json"] = ask(*client, "system.metrics").dump(2) + "\n";
+    files["history.json"] =
+        ask(*client, "system.history", {{"hours", most_history_hours}, {"limit", most_history_samples}}).dump(2) + "\n";
     files["describe.json"] = ask(*client, "system.describe").dump(2) + "\n";
     avatars = ask(*client, "avatar.list").value("avatars", Json::array());
   }

@@ -93,7 +93,8 @@ class Conformance:
 
     def answers_match(self):
         with self.booth() as booth:
-            for method in ("system.describe", "system.status", "system.metrics", "job.list", "avatar.list"):
+            for method in ("system.describe", "system.status", "system.metrics", "system.history", "job.list",
+                           "avatar.list"):
                 self.schema.check(self.schema.methods[method]["result"], booth.call(method))
 
     def raw(self, text):

@@ -293,8 +293,9 @@ TEST_F(Process, TheReportHoldsNothingOfTheVisitors) {
   ASSERT_EQ(said.first, 0);
   fs::create_directories(unpacked);
   ASSERT_EQ(run({"/bin/tar", "-xzf", report, "-C", unpacked}).first, 0);
-  EXPECT_THAT(entries(unpacked), testing::UnorderedElementsAre("boothd.toml", "describe.json", "doctor.json", "log.txt",
-                                                               "metrics.json", "status.json", "versions.txt"));
+  EXPECT_THAT(entries(unpacked),
+              testing::UnorderedElementsAre("boothd.toml", "describe.json", "doctor.json", "history.json", "log.txt",
+                                            "metrics.json", "status.json", "versions.txt"));
   for (const std::string& name : entries(unpacked)) {
     std::ifstream file(unpacked / name);
     const std::string text((std::istreambuf_iterator<char>(file)), {});
@@ -308,6 +309,8 @@ TEST_F(Process, TheReportHoldsNothingOfTheVisitors) {
 
   EXPECT_THAT(boothctl({"metrics", "--prometheus"}).second,
               testing::HasSubstr("# TYPE booth_request_seconds histogram"));
+  EXPECT_THAT(boothctl({"history"}).second,
+              testing::AllOf(testing::HasSubstr("started 1 times; captures "), testing::HasSubstr(" threads")));
   ASSERT_EQ(boothctl({"shutdown"}).first, 0);
   wait_exit();
   EXPECT_EQ(run({BOOTHCTL, "--control", options_.config.api.control, "--timeout", "0.2", "report", "--to", report,

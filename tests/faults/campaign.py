@@ -2,9 +2,9 @@
 """The booth under faults: killed, denied the disk, with failing cameras and a clock that jumps; each time it is started
 again, and everything that was acknowledged must be there, whole or named as failed, and nothing half-made or left over.
 
-    campaign.py [--full] [--seed N] [--only PART] [--keep DIR] BIN_DIR SHIM
+    campaign.py [--full] [--seed N] [--only PART [--from OPERATION]] [--keep DIR] BIN_DIR SHIM
 
-BIN_DIR holds boothd and booth-reconstruct, SHIM is the library that fault_shim.cpp becomes. Without --full a small part
+--from goes on with `operations` where another run was stopped. BIN_DIR holds boothd and booth-reconstruct, SHIM is the library that fault_shim.cpp becomes. Without --full a small part
 is drawn, as continuous integration does. Exit status 77: a Python module is missing.
 """
 
@@ -33,6 +33,7 @@ except ImportError as missing:
 MINI = pathlib.Path(__file__).resolve().parents[2] / "replay/recordings/mini"
 SESSION_WITHIN_S = 60
 SWEPT_WITHIN_S = 20
+PROGRESS_EVERY_S = 60
 MOST_KEPT = 12  # captures; the oldest are deleted, as a test of their own
 
 INTERRUPTED = "the booth was stopped while capturing"
@@ -72,9 +73,9 @@ class Control:
 
 
 class Campaign:
-    def __init__(self, bin_dir, shim, folder, seed, full):
+    def __init__(self, bin_dir, shim, folder, seed, full, first_operation):
         self.random = random.Random(seed)
-        self.full = full
+        self.full, self.first_operation = full, first_operation
         self.folder = folder
         self.booth = Booth(bin_dir, folder)
         self.real = None
@@ -317,10 +318,17 @@ class Campaign:
         cases = [(True, at, fault) for at in range(1, session_count + 1) for fault in faults]
         cases += [(False, at, fault) for at in range(1, start_count + 1) for fault in faults
                   if fault[0] in (FAIL, KILL_SELF)]
+        # Numbered through: those of a start follow those of a session.
+        cases = [c for c in cases if c[1] + (0 if c[0] else session_count) >= self.first_operation]
         if not self.full:
-            cases = self.random.sample(cases, 30)
+            cases = self.random.sample(cases, min(30, len(cases)))
+        told = time.monotonic()
         for in_session, at, (mode, span, error) in cases:
             name = {FAIL: errno.errorcode.get(error), TEAR: "torn write", KILL_SELF: "kill", KILL_ALL: "kill of all"}
+            if time.monotonic() - told > PROGRESS_EVERY_S:
+                told = time.monotonic()
+                print(f"  at operation {at + (0 if in_session else session_count)} of {session_count + start_count}",
+                      flush=True)
             what = f"{name[mode]}{' and on' if span > 1 else ''} at operation {at} of a " + \
                    ("session" if in_session else "start")
             if mode == TEAR and error:
@@ -455,6 +463,7 @@ def main():
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only")
+    parser.add_argument("--from", type=int, default=1, dest="first_operation")
     parser.add_argument("--keep", help="a new folder that stays, with the booth's log")
     parser.add_argument("bin_dir")
     parser.add_argument("shim")
@@ -466,7 +475,8 @@ def main():
             folder.mkdir(parents=True)
         else:
             folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="booth-faults-")))
-        campaign = Campaign(given.bin_dir, pathlib.Path(given.shim).resolve(), folder, given.seed, given.full)
+        campaign = Campaign(given.bin_dir, pathlib.Path(given.shim).resolve(), folder, given.seed, given.full,
+                            given.first_operation)
         try:
             return campaign.all(given.only)
         finally:

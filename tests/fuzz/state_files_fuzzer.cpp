@@ -5,12 +5,14 @@
 #include <cstdlib>
 #include <filesystem>
 #include <fstream>
+#include <nlohmann/json.hpp>
 #include <string>
 
 #include "daemon/api/curve_keys.h"
 #include "daemon/api/key_store.h"
 #include "daemon/avatar_store.h"
 #include "daemon/background_store.h"
+#include "daemon/health_history.h"
 #include "daemon/job_queue.h"
 #include "daemon/projector_delay.h"
 
@@ -18,11 +20,11 @@ namespace {
 
 namespace fs = std::filesystem;
 
-/// Files that the booth keeps for itself, or that an operator hands it: jobs, answers, avatars, backgrounds, keys.
-/// Every name that is read from the disk at the start.
+/// Files that the booth keeps for itself, or that an operator hands it: jobs, answers, avatars, backgrounds, keys, its
+/// history. Every name that is read from the disk at the start.
 constexpr const char* files[] = {
     "jobs/2026.json",   "keys.jsonl", "avatars/2026/metadata.json", "backgrounds/2026/recording.json",
-    "clients/one.json", "secret.key", "projector-delay.json"};
+    "clients/one.json", "secret.key", "projector-delay.json",       "history.json"};
 
 /// In memory: nothing waits for a disk.
 const fs::path& folder() {
@@ -73,5 +75,8 @@ extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     require(booth::api::is_curve_key(keys->server_key));
   if (const auto delay = booth::read_projector_delay(folder() / "projector-delay.json"))
     require(delay->delay_us >= 0 && delay->delay_us <= 1'000'000);
+  const booth::HealthHistory history(folder() / "history.json");
+  for (const booth::HealthSample& sample : history.samples({}, 10))
+    require(booth::health_sample_from(booth::to_json(sample)).has_value());
   return 0;
 }

@@ -124,6 +124,10 @@ class Booth:
         return Status(told["state"], told["ready"], told["not_ready"], told["capture"], told["boot"],
                       told["sequence"], told)
 
+    def history(self, *, hours: int = 24, limit: int = 100) -> list[dict[str, Any]]:
+        """How the booth has been, oldest first, over restarts: at most `limit` samples of the last so many hours."""
+        return self.call("system.history", hours=hours, limit=limit)["samples"]
+
     def subscribe(self) -> None:
         """Events from now on, or soon, come by events(). To be called before what one wants to hear of."""
         if self._subscriber is None:
