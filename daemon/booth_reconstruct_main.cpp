@@ -8,7 +8,9 @@
 
 #include <CLI/CLI.hpp>
 #include <atomic>
+#include <chrono>
 #include <cstdio>
+#include <fstream>
 #include <iostream>
 #include <nlohmann/json.hpp>
 #include <stop_token>
@@ -17,6 +19,7 @@
 
 #include "config/booth_config.h"
 #include "daemon/face_model_loader.h"
+#include "daemon/job_trace.h"
 #include "daemon/progress_pipe.h"
 #include "daemon/reconstruct_job.h"
 #include "pipeline/thread_pool.h"
@@ -81,7 +84,7 @@ class StopOnSignal {
 };
 
 struct Arguments {
-  std::string recording, avatar, config, face, texture;
+  std::string recording, avatar, config, face, texture, trace;
   bool timings = false;
   int progress_fd = -1;
   unsigned threads = 0;
@@ -119,9 +122,11 @@ int run(const Arguments& arguments) {
   if (!arguments.face.empty()) options.face = *face_mode_from(arguments.face);
   if (!arguments.texture.empty()) options.atlas.method = *texture_method_from(arguments.texture);
 
+  const auto started = std::chrono::steady_clock::now();
   const StopOnSignal stop;
   ThreadPool pool(arguments.threads);
-  Work work = pool.work();
+  JobTrace trace;
+  Work work = arguments.trace.empty() ? pool.work() : trace.watch(pool.work());
   work.stop = stop.token();
   ProgressBar bar;
   const bool draw = isatty(STDERR_FILENO) != 0 && arguments.progress_fd < 0;
@@ -140,16 +145,14 @@ int run(const Arguments& arguments) {
       },
       [&](const std::vector<CameraHealth>& cameras) { tell_health(pipe, cameras); });
   bar.clear();
+  if (!arguments.trace.empty() && !(std::ofstream(arguments.trace) << trace.json() << std::flush))
+    std::cerr << "warning: " << arguments.trace << ": the trace cannot be written\n";
   if (!made) return fail(pipe, made.error(), exit_failed);
   for (const std::string& warning : made->warnings) std::cerr << "warning: " << warning << "\n";
   if (arguments.timings) {
     nlohmann::ordered_json times;
-    double total = 0;
-    for (const auto& [stage, seconds] : made->stage_seconds) {
-      times[stage] = seconds;
-      total += seconds;
-    }
-    times["total"] = total;
+    for (const auto& [stage, seconds] : made->stage_seconds) times[stage] = seconds;
+    times["total"] = std::chrono::duration<double>(std::chrono::steady_clock::now() - started).count();
     std::cout << times.dump() << std::endl;
   }
   return 0;
@@ -175,6 +178,8 @@ int main(int argc, char** argv) {
       ->check(CLI::IsMember({"full", "blend", "best_view"}));
   app.add_option("--config", arguments.config, "the booth's configuration file");
   app.add_flag("--timings", arguments.timings, "print the seconds of each stage as JSON");
+  app.add_option("--trace", arguments.trace,
+                 "write where time and memory went to this file, for ui.perfetto.dev or chrome://tracing");
   app.add_option("--threads", arguments.threads, "how many to use; 0 for as many as there are processors")
       ->check(CLI::Range(0, 1024));
   app.add_option("--progress-fd", arguments.progress_fd,

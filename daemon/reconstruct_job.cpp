@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <chrono>
 #include <ctime>
+#include <optional>
 
 #include "pipeline/export/avatar_files.h"
 #include "replay/durable_folder.h"
@@ -25,7 +26,7 @@ double share_of(std::string_view stage) {
   return 0.05;
 }
 
-/// Times the stages and turns their fractions into the whole job's.
+/// Times the stages, which may overlap, and turns their fractions into the whole job's.
 class StageClock {
  public:
   explicit StageClock(const JobProgress& progress) : progress_(progress) {
@@ -33,40 +34,38 @@ class StageClock {
   }
 
   void tell(std::string_view stage, double fraction) {
-    if (stage != stage_) begin(stage);
-    if (progress_) {
-      const double whole = (done_ + std::clamp(fraction, 0.0, 1.0) * share_of(stage)) / total_;
-      highest_ = std::max(highest_, std::min(whole, 1.0));
-      progress_(stage, highest_);
-    }
+    auto told = std::find_if(stages_.begin(), stages_.end(), [&](const Stage& s) { return s.name == stage; });
+    if (told == stages_.end()) told = stages_.insert(told, {std::string(stage), SteadyClock::now(), {}, 0});
+    told->fraction = std::max(told->fraction, std::clamp(fraction, 0.0, 1.0));
+    if (told->fraction >= 1 && !told->seconds) told->seconds = seconds_since(told->began);
+    if (!progress_) return;
+    double done = 0;
+    for (const Stage& s : stages_) done += s.fraction * share_of(s.name);
+    const auto under_way = std::find_if(stages_.begin(), stages_.end(), [](const Stage& s) { return s.fraction < 1; });
+    progress_(under_way == stages_.end() ? stage : under_way->name, std::min(done / total_, 1.0));
   }
 
-  /// Ends the stage under way and hands out the times.
-  std::vector<std::pair<std::string, double>> finish() {
-    end();
-    return times_;
+  /// Each stage's seconds, in the order in which they began; so far, where one is under way.
+  std::vector<std::pair<std::string, double>> times() const {
+    std::vector<std::pair<std::string, double>> times;
+    for (const Stage& s : stages_) times.emplace_back(s.name, s.seconds ? *s.seconds : seconds_since(s.began));
+    return times;
   }
 
  private:
-  void begin(std::string_view stage) {
-    end();
-    stage_ = stage;
-    started_ = SteadyClock::now();
-  }
-  void end() {
-    if (stage_.empty()) return;
-    times_.emplace_back(stage_, std::chrono::duration<double>(SteadyClock::now() - started_).count());
-    done_ += share_of(stage_);
-    stage_.clear();
+  struct Stage {
+    std::string name;
+    SteadyClock::time_point began;
+    std::optional<double> seconds;  ///< once it has ended
+    double fraction;
+  };
+  static double seconds_since(SteadyClock::time_point then) {
+    return std::chrono::duration<double>(SteadyClock::now() - then).count();
   }
 
   const JobProgress& progress_;
   double total_ = 0;
-  double done_ = 0;
-  double highest_ = 0;
-  std::string stage_;
-  SteadyClock::time_point started_;
-  std::vector<std::pair<std::string, double>> times_;
+  std::vector<Stage> stages_;
 };
 
 /// Whether there is something at `target` that a new avatar replaces: an earlier avatar, and nothing else.
@@ -156,9 +155,13 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   const auto recording = read_recording(recording_folder);
   if (!recording) return recording.error();
   JobReport report;
-  auto capture = load_capture(*recording, options.face, work, &report.warnings);
+  auto capture = [&] {
+    const Step step(work, "load");
+    return load_capture(*recording, options.face, work, &report.warnings);
+  }();
   if (work.stopped()) return Work::cancelled();
   if (!capture) return capture.error();
+  clock.tell("load", 1);
 
   const auto stage_progress = [&](std::string_view stage, double fraction) { clock.tell(stage, fraction); };
   auto made = reconstruct(*std::move(capture), options, sources, work, stage_progress, health);
@@ -174,8 +177,9 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   metadata.face = to_string(made->face);
   metadata.texture_method = to_string(options.atlas.method);
   metadata.warnings = report.warnings;
-  metadata.stage_seconds = clock.finish();
+  metadata.stage_seconds = clock.times();
   clock.tell("export", 0);
+  const Step step(work, "export");
   for (const NamedBytes& file : make_avatar_files(made->avatar, std::move(metadata), files, work))
     if (const auto written = folder->write(file.name, file.bytes); !written) return written.error();
   if (work.stopped()) return Work::cancelled();
@@ -183,7 +187,7 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
     if (const auto removed = remove_folder(parent, target.filename().string()); !removed) return removed.error();
   if (const auto committed = folder->commit(); !committed) return committed.error();
   clock.tell("export", 1);
-  report.stage_seconds = clock.finish();
+  report.stage_seconds = clock.times();
   return report;
 }
 

@@ -16,11 +16,12 @@ namespace booth {
 /// The stages of a job in their order: "load", those of reconstruct(), "export".
 const std::vector<std::string>& job_stages();
 
-/// Called with the stage under way and the fraction of the whole job, 0 … 1, never falling.
+/// Called with the stage under way, of several the one that began first, and the fraction of the whole job, 0 … 1,
+/// never falling; by one thread at a time.
 using JobProgress = std::function<void(std::string_view stage, double fraction)>;
 
 struct JobReport {
-  std::vector<std::pair<std::string, double>> stage_seconds;  ///< in the order the stages ran
+  std::vector<std::pair<std::string, double>> stage_seconds;  ///< in the order they began; stages may overlap
   std::vector<std::string> warnings;                          ///< as in the metadata
 };
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <memory>
+#include <mutex>
 #include <optional>
 #include <span>
 #include <utility>
@@ -33,7 +34,7 @@ constexpr std::array<std::pair<FaceMode, std::string_view>, 4> face_mode_names{{
 class StageReport {
  public:
   StageReport(std::string_view stage, const Work& work, const StageProgress& progress)
-      : stage_(stage), progress_(progress), work_(work) {
+      : stage_(stage), progress_(progress), work_(work), step_(work, stage) {
     work_.progress = [this](double fraction) { tell(fraction); };
     tell(0);
   }
@@ -50,7 +51,17 @@ class StageReport {
   std::string_view stage_;
   const StageProgress& progress_;
   Work work_;
+  const Step step_;
 };
+
+/// The same sink for stages that overlap.
+StageProgress one_at_a_time(const StageProgress& progress) {
+  if (!progress) return {};
+  return [&progress, mutex = std::make_shared<std::mutex>()](std::string_view stage, double fraction) {
+    const std::lock_guard lock(*mutex);
+    progress(stage, fraction);
+  };
+}
 
 struct SegmentedViews {
   std::vector<Silhouette> silhouettes;
@@ -294,10 +305,26 @@ bool is_sewn(const FaceSurface& face, const ReconstructionOptions& options) {
   return face.made == FaceMode::passive && options.face_merge.method == FaceMergeMethod::sewing;
 }
 
+/// The face in the hull's field, where it is not to be joined as a mesh.
+void join_face(Field* field, const FaceSurface& face, const ReconstructionOptions& options, const Work& work) {
+  const Step step(work, "surface: face");
+  if (face.made == FaceMode::passive) {
+    if (!is_sewn(face, options))
+      *field = blend_surface(*field, face.fit->patch.mesh, face.fit->patch.weight, face.eye, work);
+  } else if (options.face_merge.method != FaceMergeMethod::radial) {
+    *field = fuse_scan(*field, face.head, face.scan, face.eye, work);
+  }
+  keep_largest_part(*field, work);
+}
+
 /// The closed surface within its budget of triangles, with the face's scan where there is one that meets it.
 Mesh make_surface(const Field& field, const FaceSurface* face, const ReconstructionOptions& options, const Work& work,
                   std::vector<std::string>* warnings, FaceMode* made) {
-  const Mesh mesh = smooth_hc(extract_surface(field, work), options.smoothing, work);
+  const Mesh mesh = [&] {
+    const Step step(work, "surface: extraction");
+    return smooth_hc(extract_surface(field, work), options.smoothing, work);
+  }();
+  const Step step(work, "surface: decimation");
   if (face == nullptr) return decimate(mesh, options.decimation, work);
   if (is_sewn(*face, options)) {
     auto sewn = sew_face(mesh, face->fit->patch);
@@ -324,29 +351,31 @@ std::vector<uint8_t> inside(const Eigen::AlignedBox3d& box, const Mesh& mesh) {
   return in_box;
 }
 
-/// Skeleton and weights, or an avatar left unrigged with a warning: a shape that cannot be rigged is still worth
-/// having.
-Result<void> rig_avatar(Avatar* avatar, const ReconstructionOptions& options, const Work& work,
-                        const StageProgress& progress, std::vector<std::string>* warnings) {
-  const auto unrigged = [&](const Error& error) -> Result<void> {
+/// A skeleton and its weights, or neither and why: a shape that cannot be rigged is still worth having.
+struct Rigging {
+  Skeleton skeleton;
+  Skin skin;
+  std::vector<std::string> warnings;
+};
+Result<Rigging> rig_surface(const Mesh& mesh, const ReconstructionOptions& options, const Work& work,
+                            const StageProgress& progress) {
+  const auto unrigged = [](const Error& error) -> Result<Rigging> {
     if (error.code == ErrorCode::cancelled) return error;
-    avatar->skeleton = {};
-    avatar->skin = {};
-    warnings->push_back("the avatar is not rigged: " + error.message);
-    return {};
+    return Rigging{{}, {}, {"the avatar is not rigged: " + error.message}};
   };
+  Rigging rigging;
   {
     const StageReport report("skeleton", work, progress);
-    auto fitted = fit_skeleton(avatar->mesh, options.skeleton, report.work());
+    auto fitted = fit_skeleton(mesh, options.skeleton, report.work());
     if (!fitted) return unrigged(fitted.error());
-    avatar->skeleton = std::move(fitted->skeleton);
-    warnings->insert(warnings->end(), fitted->warnings.begin(), fitted->warnings.end());
+    rigging.skeleton = std::move(fitted->skeleton);
+    rigging.warnings = std::move(fitted->warnings);
   }
   const StageReport report("skin", work, progress);
-  auto skin = compute_skin(avatar->mesh, avatar->skeleton, options.skinning, report.work());
+  auto skin = compute_skin(mesh, rigging.skeleton, options.skinning, report.work());
   if (!skin) return unrigged(skin.error());
-  avatar->skin = std::move(*skin);
-  return {};
+  rigging.skin = std::move(*skin);
+  return rigging;
 }
 
 }  // namespace
@@ -372,8 +401,9 @@ const std::vector<std::string>& reconstruction_stages() {
 }
 
 Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOptions& options,
-                                   const FaceSources& sources, const Work& work, const StageProgress& progress,
+                                   const FaceSources& sources, const Work& work, const StageProgress& sink,
                                    const HealthReport& health) {
+  const StageProgress progress = one_at_a_time(sink);
   if (const auto developed = develop_all(capture, work); !developed) return developed.error();
   if (const auto checked = check(capture.rig); !checked) return checked.error();
   Reconstruction result;
@@ -421,15 +451,13 @@ Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOp
   Avatar& avatar = result.avatar;
   {
     const StageReport report("surface", work, progress);
-    if (face && face->made == FaceMode::passive) {
-      if (!is_sewn(*face, options))
-        hull.field =
-            blend_surface(hull.field, face->fit->patch.mesh, face->fit->patch.weight, face->eye, report.work());
-    } else if (face && options.face_merge.method != FaceMergeMethod::radial)
-      hull.field = fuse_scan(hull.field, face->head, face->scan, face->eye, report.work());
-    if (face) keep_largest_part(hull.field, report.work());
-    remove_small_handles(hull.field, options.handles, report.work());
+    if (face) join_face(&hull.field, *face, options, report.work());
+    {
+      const Step step(work, "surface: handles");
+      remove_small_handles(hull.field, options.handles, report.work());
+    }
     avatar.mesh = make_surface(hull.field, face ? &*face : nullptr, options, report.work(), &warnings, &result.face);
+    const Step step(work, "surface: untangling");
     if (const size_t left = remove_self_intersections(&avatar.mesh, report.work()); left > 0)
       warnings.push_back("the surface passes through itself at " + std::to_string(left) + " edges");
     if (result.face == FaceMode::passive)
@@ -440,18 +468,23 @@ Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOp
     if (avatar.mesh.triangles.empty()) return Error{ErrorCode::no_subject, "no surface is left after carving"};
   }
 
-  {
+  Result<TextureAtlas> textured = Work::cancelled();
+  Result<Rigging> rigged = Work::cancelled();
+  const auto texture = [&] {
     const StageReport report("atlas", work, progress);
-    auto textured = build_texture_atlas(avatar.mesh, *hull.rig, frames, views.silhouettes, options.atlas, report.work(),
-                                        face ? inside(face->head.box(), avatar.mesh) : std::vector<uint8_t>{});
-    if (!textured) return textured.error();
-    avatar.mesh.positions = std::move(textured->positions);
-    remove_self_intersections(&avatar.mesh, report.work());
-    avatar.atlas = std::move(textured->atlas);
-    warnings.insert(warnings.end(), textured->warnings.begin(), textured->warnings.end());
-  }
-
-  if (const auto rigged = rig_avatar(&avatar, options, work, progress, &warnings); !rigged) return rigged.error();
+    textured = build_texture_atlas(avatar.mesh, *hull.rig, frames, views.silhouettes, options.atlas, report.work(),
+                                   face ? inside(face->head.box(), avatar.mesh) : std::vector<uint8_t>{});
+  };
+  work.both(texture, [&] { rigged = rig_surface(avatar.mesh, options, work, progress); });
+  if (!textured) return textured.error();
+  if (!rigged) return rigged.error();
+  avatar.mesh.positions = std::move(textured->positions);
+  remove_self_intersections(&avatar.mesh, work);
+  avatar.atlas = std::move(textured->atlas);
+  avatar.skeleton = std::move(rigged->skeleton);
+  avatar.skin = std::move(rigged->skin);
+  warnings.insert(warnings.end(), textured->warnings.begin(), textured->warnings.end());
+  warnings.insert(warnings.end(), rigged->warnings.begin(), rigged->warnings.end());
   return result;
 }
 

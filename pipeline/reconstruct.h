@@ -98,13 +98,14 @@ struct Reconstruction {
 /// The names of the stages in their order.
 const std::vector<std::string>& reconstruction_stages();
 
-/// Called when a stage begins (fraction 0), while it runs, and when it ends (1).
+/// Called when a stage begins (fraction 0), while it runs, and when it ends (1); by one thread at a time. Stages that
+/// do not need each other's results may overlap.
 using StageProgress = std::function<void(std::string_view stage, double fraction)>;
 
 /// Called once, when it is known what the capture says about the cameras: by id.
 using HealthReport = std::function<void(const std::vector<CameraHealth>& cameras)>;
 
-/// The whole method: segment → hull → refine → face → surface → atlas → skeleton → skin.
+/// The whole method: segment → hull → refine → face → surface → atlas, and beside it skeleton → skin.
 ///
 /// @param capture     each part of it is freed as soon as no stage needs it any more
 /// @param work        its progress is not used; stages report through `progress`

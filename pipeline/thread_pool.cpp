@@ -7,11 +7,6 @@
 #include <exception>
 
 namespace booth {
-namespace {
-
-thread_local bool inside_piece = false;
-
-}  // namespace
 
 struct ThreadPool::Loop {
   size_t count, grain;
@@ -19,6 +14,8 @@ struct ThreadPool::Loop {
   std::atomic<size_t> next{0};
   std::mutex fault_mutex;
   std::exception_ptr fault;  ///< guarded by fault_mutex; the first one
+  size_t number = 0;         ///< in the order in which loops began
+  size_t helpers = 0;        ///< guarded by the pool's mutex_; other threads at this loop's pieces
 };
 
 ThreadPool::ThreadPool(unsigned threads) {
@@ -34,7 +31,6 @@ ThreadPool::~ThreadPool() {
 }
 
 void ThreadPool::work_on(Loop& loop) {
-  inside_piece = true;
   for (;;) {
     const size_t begin = loop.next.fetch_add(loop.grain, std::memory_order_relaxed);
     if (begin >= loop.count) break;
@@ -46,39 +42,45 @@ void ThreadPool::work_on(Loop& loop) {
       loop.next.store(loop.count, std::memory_order_relaxed);
     }
   }
-  inside_piece = false;
+}
+
+/// Works on the newest loop. @pre mutex_ is held by `lock` and there is one
+void ThreadPool::help(std::unique_lock<std::mutex>& lock) {
+  Loop& loop = *loops_.back();
+  ++loop.helpers;
+  lock.unlock();
+  work_on(loop);
+  lock.lock();
+  std::erase(loops_, &loop);
+  if (--loop.helpers == 0) news_.notify_all();
 }
 
 void ThreadPool::worker(const std::stop_token& stop) {
-  size_t seen = 0;
   std::unique_lock lock(mutex_);
-  while (wake_.wait(lock, stop, [&] { return loop_ != nullptr && generation_ != seen; })) {
-    seen = generation_;
-    Loop& loop = *loop_;
-    ++inside_;
-    lock.unlock();
-    work_on(loop);
-    lock.lock();
-    if (--inside_ == 0) idle_.notify_all();
-  }
+  while (news_.wait(lock, stop, [&] { return !loops_.empty(); })) help(lock);
 }
 
 void ThreadPool::run(size_t count, size_t grain, const Work::Range& body) {
   grain = std::max<size_t>(grain, 1);
-  if (workers_.empty() || inside_piece || count <= grain) return Work{}.parallel_for(count, grain, body);
-  const std::lock_guard one_at_a_time(caller_mutex_);
+  if (workers_.empty() || count <= grain) return Work{}.parallel_for(count, grain, body);
   Loop loop{.count = count, .grain = grain, .body = body, .next = {}, .fault_mutex = {}, .fault = {}};
   {
     const std::lock_guard lock(mutex_);
-    loop_ = &loop;
-    ++generation_;
+    loop.number = begun_++;
+    loops_.push_back(&loop);
   }
-  wake_.notify_all();
+  news_.notify_all();
   work_on(loop);
   {
     std::unique_lock lock(mutex_);
-    loop_ = nullptr;
-    idle_.wait(lock, [&] { return inside_ == 0; });
+    std::erase(loops_, &loop);
+    const auto newer = [&] { return !loops_.empty() && loops_.back()->number > loop.number; };
+    while (loop.helpers > 0) {
+      if (newer())
+        help(lock);
+      else
+        news_.wait(lock, [&] { return loop.helpers == 0 || newer(); });
+    }
   }
   if (loop.fault) std::rethrow_exception(loop.fault);
 }

@@ -11,8 +11,9 @@
 
 namespace booth {
 
-/// A few threads that run the pieces of a Work::parallel_for. One loop at a time; the caller works along, and a
-/// loop started from inside a piece runs serially on its thread.
+/// A few threads that run the pieces of Work::parallel_for. The caller of a loop works along; loops may be started by
+/// several threads and from inside pieces. A thread with nothing to do helps with the loop started last, a caller that
+/// waits for the rest of its own loop with those started since: its pieces may be waiting for them.
 class ThreadPool {
  public:
   /// @param threads  how many work at once, the caller included; 0 for as many as there are processors
@@ -33,14 +34,12 @@ class ThreadPool {
   struct Loop;
   static void work_on(Loop& loop);
   void worker(const std::stop_token& stop);
+  void help(std::unique_lock<std::mutex>& lock);
 
-  std::mutex caller_mutex_;  ///< held by the caller of the one loop under way
   std::mutex mutex_;
-  std::condition_variable_any wake_;
-  std::condition_variable idle_;
-  Loop* loop_ = nullptr;   ///< guarded by mutex_
-  size_t generation_ = 0;  ///< guarded by mutex_; counts loops, so that a worker joins each at most once
-  size_t inside_ = 0;      ///< guarded by mutex_; workers that hold a pointer to loop_
+  std::condition_variable_any news_;  ///< a loop began, or the last helper left one
+  std::vector<Loop*> loops_;          ///< guarded by mutex_; those that may have pieces to give, the newest last
+  size_t begun_ = 0;                  ///< guarded by mutex_; loops so far
   std::vector<std::jthread> workers_;
 };
 

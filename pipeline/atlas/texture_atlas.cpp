@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <optional>
 #include <utility>
 
 #include "pipeline/atlas/blending.h"
@@ -182,6 +183,7 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& untextured, const Rig& rig,
   const Inpainting inpainting = options.method == TextureMethod::full ? Inpainting::push_pull : Inpainting::telea;
   Mesh mesh = untextured;
   std::vector<PreparedView> views(sources.size());
+  std::optional<Step> step(std::in_place, work, "atlas: pictures");
   work.parallel_for(sources.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end; ++i)
       views[i] = prepare_view(mesh, *sources[i].camera, *sources[i].frame, *sources[i].silhouette, rim_m, inpainting);
@@ -189,6 +191,7 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& untextured, const Rig& rig,
   if (work.stopped()) return Work::cancelled();
   work.report(0.3);
 
+  step.emplace(work, "atlas: ratings");
   const Occluder occluder(mesh);
   const CameraRatings ratings = rate_cameras(mesh, occluder, views, work);
   result.seen_share = seen_share(mesh, ratings);
@@ -196,10 +199,12 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& untextured, const Rig& rig,
   if (work.stopped()) return Work::cancelled();
   work.report(0.4);
 
+  step.emplace(work, "atlas: agreement");
   if (options.method == TextureMethod::full) prepare_fully(&mesh, views, ratings, exact, options, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.5);
 
+  step.emplace(work, "atlas: charts");
   const Packing packing = lay_out(mesh, ratings, options, work);
   if (!(packing.texels_per_m > 0))
     return Error{ErrorCode::unsupported,
@@ -207,10 +212,12 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& untextured, const Rig& rig,
   if (work.stopped()) return Work::cancelled();
   work.report(0.6);
 
+  step.emplace(work, "atlas: texels");
   TexelColours texels = paint(mesh, packing, views, ratings, occluder, options, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.95);
 
+  step.emplace(work, "atlas: filling");
   result.used_share = texels.used_share;
   result.positions = std::move(mesh.positions);
   result.atlas.uv = texture_coordinates(packing, options.size);

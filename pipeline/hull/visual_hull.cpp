@@ -287,7 +287,10 @@ Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette>
   VisualHull hull;
   const auto own_rig = std::make_shared<Rig>(rig);
   hull.rig = own_rig;
-  SilhouetteViews views = make_views(*own_rig, silhouettes, work);
+  SilhouetteViews views = [&] {
+    const Step step(work, "hull: outline distances");
+    return make_views(*own_rig, silhouettes, work);
+  }();
   if (work.stopped()) return Work::cancelled();
   work.report(0.3);
 
@@ -305,12 +308,16 @@ Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette>
 
   SolidParts parts;
   const auto carve = [&] {
+    const Step step(work, "hull: carving");
     hull.field = Carving(rig, views, options, work).run();
     if (!work.stopped()) parts = keep_largest_part(hull.field, work);
   };
   carve();
   work.report(0.7);
-  const std::vector<CameraDeviation> deviations = realign_cameras(*own_rig, views, hull.field, work);
+  const std::vector<CameraDeviation> deviations = [&] {
+    const Step step(work, "hull: camera poses");
+    return realign_cameras(*own_rig, views, hull.field, work);
+  }();
   for (size_t v = 0; v < views.size(); ++v) {
     hull.agreement.push_back({.camera = views[v]->camera().id,
                               .moved = deviations[v].moved,
@@ -322,6 +329,7 @@ Result<VisualHull> carve_visual_hull(const Rig& rig, std::span<const Silhouette>
   if (any_moved && !work.stopped()) carve();
   // Where a mask lacks a part, others may seem to lack something behind it: the worst is overruled first, and the
   // others are looked at anew.
+  const Step step(work, "hull: contradictions");
   std::vector<bool> named(views.size());
   for (size_t round = 0; round < views.size() && !work.stopped(); ++round) {
     const std::vector<Contradiction> contradictions = find_contradictions(rig.volume, views, hull.field, work);

@@ -52,6 +52,7 @@ Evidence with_photographs(const Evidence& of_hull, const PhotoConsistency& photo
       doubtful.push_back(of_hull.samples[s]);
       numbers.push_back(s);
     }
+  const Step step(work, "refine: photographs");
   const auto seen = photographs.find(guess, doubtful, inwards_m, work);
   Evidence all = of_hull;
   for (size_t n = 0; n < seen.size(); ++n) {
@@ -161,7 +162,10 @@ Field refine_shape(Field hull, const SilhouetteViews& views, std::span<const Fra
   if (!options.enabled) return hull;
   Evidence evidence{sample_hull(hull, cell_m), {}};
   if (evidence.samples.empty()) return hull;
-  const std::vector<GrazingRay> rays = measure_slack(hull, views, evidence.samples, work);
+  const std::vector<GrazingRay> rays = [&] {
+    const Step step(work, "refine: slack");
+    return measure_slack(hull, views, evidence.samples, work);
+  }();
   evidence.weights = weights_of(evidence.samples, options);
 
   constexpr int coarsest_iterations = 100, iterations = 10;
@@ -181,6 +185,7 @@ Field refine_shape(Field hull, const SilhouetteViews& views, std::span<const Fra
   fine.solve(evidence.samples, evidence.weights, &middle, work);
   const Distance outside_by = [&](const Eigen::Vector3f& p) { return fine.at(p, spared_m); };
   const auto solve = [&](const Evidence& with) {
+    const Step step(work, "refine: smoothest surface");
     middle.solve(with.samples, with.weights, nullptr, work);
     fine.solve(with.samples, with.weights, &middle, work);
   };
@@ -197,6 +202,7 @@ Field refine_shape(Field hull, const SilhouetteViews& views, std::span<const Fra
   hold_at_rays(all, rays, outside_by);
   solve(all);
   if (work.stopped()) return hull;
+  const Step step(work, "refine: carving");
   Field refined = carve(std::move(hull), outside_by, work);
   keep_largest_part(refined, work);
   return refined;

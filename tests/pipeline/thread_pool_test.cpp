@@ -61,19 +61,31 @@ TEST_P(ThreadPoolOf, ThrowsAPiecesExceptionAgainAndStaysUsable) {
   }
 }
 
-TEST_P(ThreadPoolOf, RunsALoopWithinAPieceOnThePiecesThread) {
+TEST_P(ThreadPoolOf, RunsLoopsWithinPieces) {
   ThreadPool pool(GetParam());
-  std::vector<std::atomic<int>> seen(64);
-  std::atomic<int> strayed{0};
-  pool.run(8, 1, [&](size_t outer, size_t) {
-    const auto here = std::this_thread::get_id();
-    pool.run(8, 1, [&](size_t inner, size_t) {
-      if (std::this_thread::get_id() != here) ++strayed;
-      ++seen[outer * 8 + inner];
+  for (int round = 0; round < 50; ++round) {
+    std::vector<std::atomic<int>> seen(8 * 8 * 8);
+    pool.run(8, 1, [&](size_t outer, size_t) {
+      pool.run(8, 3, [&](size_t begin, size_t end) {
+        for (size_t middle = begin; middle < end; ++middle)
+          pool.run(8, 1, [&](size_t inner, size_t) { ++seen[(outer * 8 + middle) * 8 + inner]; });
+      });
     });
-  });
-  EXPECT_EQ(strayed, 0);
-  EXPECT_THAT(std::vector<int>(seen.begin(), seen.end()), testing::Each(1));
+    ASSERT_THAT(std::vector<int>(seen.begin(), seen.end()), testing::Each(1));
+  }
+}
+
+TEST_P(ThreadPoolOf, ThrowsOutOfLoopsWithinPieces) {
+  ThreadPool pool(GetParam());
+  const auto fails = [&] {
+    pool.run(4, 1, [&](size_t outer, size_t) {
+      pool.run(4, 1, [&](size_t inner, size_t) {
+        if (outer == 2 && inner == 1) throw std::runtime_error("piece");
+      });
+    });
+  };
+  EXPECT_THROW(fails(), std::runtime_error);
+  EXPECT_THAT(visits(pool.work(), 50, 2), testing::Each(1));
 }
 
 TEST_P(ThreadPoolOf, ServesSeveralCallers) {
@@ -114,6 +126,33 @@ TEST(ThreadPool, UsesItsThreadsAtTheSameTime) {
     while (begun < 3) std::this_thread::yield();
   });
   EXPECT_EQ(begun, 3);
+}
+
+TEST(ThreadPool, LendsAnIdleThreadToALoopWithinAPiece) {
+  ThreadPool pool(2);
+  std::atomic<bool> second_done{false};
+  std::atomic<int> begun{0};
+  // The second piece is over at once; its thread must then join the loop inside the first, or this would never end.
+  pool.work().both(
+      [&] {
+        while (!second_done) std::this_thread::yield();
+        pool.run(2, 1, [&](size_t, size_t) {
+          ++begun;
+          while (begun < 2) std::this_thread::yield();
+        });
+      },
+      [&] { second_done = true; });
+  EXPECT_EQ(begun, 2);
+}
+
+TEST(Work, DoesBothWithAndWithoutThreads) {
+  ThreadPool pool(2);
+  for (const Work& work : {Work{}, pool.work()}) {
+    int first = 0, second = 0;
+    work.both([&] { ++first; }, [&] { ++second; });
+    EXPECT_EQ(first, 1);
+    EXPECT_EQ(second, 1);
+  }
 }
 
 TEST(ThreadPool, TakesAllProcessorsUnlessTold) {
