@@ -8,6 +8,7 @@
 #include "pipeline/atlas/surface_diffusion.h"
 #include "pipeline/atlas/triangle_views.h"
 #include "pipeline/atlas/view_sampling.h"
+#include "pipeline/types/vector_clones.h"
 
 namespace booth {
 namespace {
@@ -139,7 +140,7 @@ class DetailPainter {
     std::array<Look, most_views_of_triangle> looks;
     Each total{}, seen{};
     for (size_t c = 0; c < cameras_.size(); ++c) {
-      look(cameras_[c], batch, &looks[c]);
+      look(cameras_[c].view, views_[cameras_[c].view.view], batch, &looks[c]);
       for (size_t i = 0; i < batch.count; ++i) {
         seen[i] += looks[c].seen[i];
         total[i] += looks[c].weight[i];
@@ -168,54 +169,66 @@ class DetailPainter {
     return a[i] * corners[0] + b[i] * corners[1] + c[i] * corners[2];
   }
 
-  void look(const DetailView& of, const TexelBatch& batch, Look* result) const {
-    const TriangleView& view = of.view;
-    Each depth;
-    view.for_each(batch.corner_weights, batch.count, &result->seen, &result->x, &result->y, &depth);
-    if (view.certain) {
-      result->weight = result->seen;
-      return;
-    }
-    for (size_t i = 0; i < batch.count; ++i) {
-      if (!(result->seen[i] > 0)) {
-        result->weight[i] = 0;
-        continue;
-      }
-      const Trust trust = look_up(views_[view.view], result->x[i], result->y[i], depth[i]);
-      result->weight[i] = result->seen[i] * weight_of(trust);
-      result->seen[i] *= trust.visible;
-    }
-  }
-
-  /// From weights to shares whose sum is 1.
-  static void fade(std::span<Look> looks, const Each& total, size_t count) {
-    // A camera below this share of the weights is not worth looking at; subtracted, so that it fades in. With at most
-    // sixteen cameras one is always above.
-    constexpr float negligible = 0.02F;
-    Each scale, used{};
-    for (size_t i = 0; i < count; ++i) scale[i] = total[i] > 0 ? 1 / total[i] : 0;
-    for (Look& look : looks)
-      for (size_t i = 0; i < count; ++i) {
-        look.weight[i] = std::max(0.0F, look.weight[i] * scale[i] - negligible);
-        used[i] += look.weight[i];
-      }
-    for (size_t i = 0; i < count; ++i) scale[i] = used[i] > 0 ? 1 / used[i] : 0;
-    for (Look& look : looks)
-      for (size_t i = 0; i < count; ++i) look.weight[i] *= scale[i];
-  }
+  static void look(const TriangleView& triangle, const PreparedView& view, const TexelBatch& batch, Look* result);
+  static void fade(std::span<Look> looks, const Each& total, size_t count);
 
   void add(const DetailView& of, const Look& look, TexelBatch& batch) const {
+    // Of a camera with a smaller share than this, the finest detail is hardly seen, and costs most.
+    constexpr float small_share = 0.2F;
     const LightPyramid& colours = views_[of.view.view].colours;
-    for (size_t i = 0; i < batch.count; ++i)
-      if (look.weight[i] > 0)
-        batch.light[i] +=
-            look.weight[i] * sample_pyramid(colours, of.view.lod, look.x[i], look.y[i]) * at(batch, i, of.correction);
+    for (size_t i = 0; i < batch.count; ++i) {
+      if (!(look.weight[i] > 0)) continue;
+      const Sharpness sharpness = look.weight[i] < small_share ? Sharpness::usual : Sharpness::full;
+      batch.light[i] += look.weight[i] * sample_pyramid(colours, of.view.lod, look.x[i], look.y[i], sharpness) *
+                        at(batch, i, of.correction);
+    }
   }
 
   std::span<const PreparedView> views_;
   std::vector<DetailView> cameras_;
   std::array<Eigen::Array4f, 3> around_;
 };
+
+BOOTH_VECTOR_CLONES
+void DetailPainter::look(const TriangleView& triangle, const PreparedView& view, const TexelBatch& batch,
+                         Look* result) {
+  Each depth;
+  triangle.for_each(batch.corner_weights, batch.count, &result->seen, &result->x, &result->y, &depth);
+  if (triangle.certain) {
+    result->weight = result->seen;
+    return;
+  }
+  const TrustCell* cells = view.trust.samples.data();
+  const int width = view.trust.width, height = view.trust.height;
+  Each visible, worth;  // of its own, so that the compiler knows that nothing written here is read there
+  for (size_t i = 0; i < batch.count; ++i) {
+    const Trust trust = look_up(cells, width, height, result->x[i], result->y[i], depth[i]);
+    visible[i] = trust.visible;
+    worth[i] = weight_of(trust);
+  }
+  for (size_t i = 0; i < batch.count; ++i) {
+    result->weight[i] = result->seen[i] * worth[i];
+    result->seen[i] *= visible[i];
+  }
+}
+
+/// From weights to shares whose sum is 1.
+BOOTH_VECTOR_CLONES
+void DetailPainter::fade(std::span<Look> looks, const Each& total, size_t count) {
+  // A camera below this share of the weights is not worth looking at; subtracted, so that it fades in. With at most
+  // sixteen cameras one is always above.
+  constexpr float negligible = 0.02F;
+  Each scale, used{};
+  for (size_t i = 0; i < count; ++i) scale[i] = total[i] > 0 ? 1 / total[i] : 0;
+  for (Look& look : looks)
+    for (size_t i = 0; i < count; ++i) {
+      look.weight[i] = std::max(0.0F, look.weight[i] * scale[i] - negligible);
+      used[i] += look.weight[i];
+    }
+  for (size_t i = 0; i < count; ++i) scale[i] = used[i] > 0 ? 1 / used[i] : 0;
+  for (Look& look : looks)
+    for (size_t i = 0; i < count; ++i) look.weight[i] *= scale[i];
+}
 
 }  // namespace
 

@@ -22,6 +22,13 @@ enum class Inpainting {
 /// The brightest that a camera delivers, as a sample of a LightImage; the other half of the range is room for gains.
 constexpr float full_light = 16383, brightest_light = 32767;
 
+/// What is known about a place between four pixels: this one, that to its right, and the two below.
+struct TrustCell {
+  float surface_m = 0;  ///< depth of the first surface, the farthest of the four; huge = none
+  /// Of the four, first the lowest byte: 255 well inside, falling to 0 at outlines, depth steps and image borders.
+  uint32_t confidence = 0;
+};
+
 /// What texturing needs of one camera, cropped to the subject. Pixel coordinates are relative to the crop.
 struct PreparedView {
   const RigCamera* camera = nullptr;
@@ -30,9 +37,8 @@ struct PreparedView {
   std::vector<Eigen::Vector3f> projected;
   LightPyramid
       colours;  ///< times the camera's colour_gain; the rim and the outside of the subject hold colours of its inside
-  FloatImage depth;  ///< metres to the first surface, at half the resolution (level 1 of the pyramid); huge = none
-  Image confidence;  ///< like `depth`: 255 well inside, falling to 0 at outlines, depth steps and image borders
-  Raster<uint16_t> margin;  ///< like `depth`: how far the silhouette's outline is, thirds of a pixel of this map
+  Raster<TrustCell> trust;  ///< at half the resolution (level 1 of the pyramid)
+  Raster<uint16_t> margin;  ///< like `trust`: how far the silhouette's outline is, thirds of a pixel of this map
   int left = 0, top = 0;    ///< of the crop in the image
 };
 

@@ -15,6 +15,7 @@
 #include <utility>
 
 #include "pipeline/atlas/planar_grid.h"
+#include "pipeline/types/vector_clones.h"
 
 namespace booth {
 namespace {
@@ -198,7 +199,7 @@ class Bin {
   Bin(int width, int height)
       : width_(width),
         height_(height),
-        words_((static_cast<size_t>(width) + 63) / 64),
+        words_((static_cast<size_t>(width) + 63) / 64 + words_behind),
         levels_(static_cast<size_t>(std::bit_width(static_cast<unsigned>(width)))),
         bits_(static_cast<size_t>(height) * levels_ * words_, 0),
         longest_free_(static_cast<size_t>(height), width) {}
@@ -207,18 +208,21 @@ class Bin {
     int x, y;
   };
 
-  /// The lowest, then leftmost place at or above row `first` whose top does not pass `best_top`.
-  std::optional<Place> find(const Footprint& footprint, int first, int best_top) const {
+  /// The lowest, then leftmost place whose top does not pass `best_top`.
+  std::optional<Place> find(const Footprint& footprint, int best_top) const {
     if (footprint.width > width_) return std::nullopt;
     const int last = std::min(height_, best_top) - footprint.height;
-    std::vector<uint64_t> open(words_);
-    for (int y = first; y <= last; ++y) {
-      set_first(open, width_ - footprint.width + 1);
+    const int places = width_ - footprint.width + 1;
+    std::vector<uint64_t> open((static_cast<size_t>(places) + 63) / 64);
+    for (int y = 0; y <= last; ++y) {
+      if (!fits_lengthwise(footprint, y)) continue;
+      std::fill(open.begin(), open.end(), ~uint64_t{0});
+      if (places % 64 != 0) open.back() >>= 64 - places % 64;
       bool any = true;
       for (const Run& run : footprint.runs)
         if (any = close(open, run, y); !any) break;
       if (!any) continue;
-      for (size_t w = 0; w < words_; ++w)
+      for (size_t w = 0; w < open.size(); ++w)
         if (open[w] != 0) return Place{static_cast<int>(64 * w) + std::countr_zero(open[w]), y};
     }
     return std::nullopt;
@@ -237,48 +241,48 @@ class Bin {
   }
 
  private:
+  /// Of each row, never set: so that any word of a shifted row can be read.
+  static constexpr size_t words_behind = 2;
+
   uint64_t* level(int y, size_t k) { return bits_.data() + (static_cast<size_t>(y) * levels_ + k) * words_; }
   const uint64_t* level(int y, size_t k) const {
     return bits_.data() + (static_cast<size_t>(y) * levels_ + k) * words_;
   }
 
-  static void set_first(std::vector<uint64_t>& open, int count) {
-    for (size_t w = 0; w < open.size(); ++w) {
-      const int here = std::clamp(count - static_cast<int>(64 * w), 0, 64);
-      open[w] = here == 64 ? ~uint64_t{0} : (uint64_t{1} << here) - 1;
-    }
+  /// Whether every row has room for the longest run there: the cheapest test, and one that most places fail.
+  bool fits_lengthwise(const Footprint& footprint, int y) const {
+    for (const Run& run : footprint.runs)
+      if (longest_free_[static_cast<size_t>(y + run.row)] < run.length()) return false;
+    return true;
   }
 
   /// Removes the places where the run would meet what is taken; false when none is left.
   bool close(std::vector<uint64_t>& open, const Run& run, int y) const {
-    if (longest_free_[static_cast<size_t>(y + run.row)] < run.length()) return false;
     const auto k = static_cast<size_t>(std::bit_width(static_cast<unsigned>(run.length())) - 1);
     const uint64_t* smeared = level(y + run.row, k);
     const int first = run.begin, second = run.end - (1 << k);
-    uint64_t left = 0;
-    for (size_t w = 0; w < words_; ++w) {
-      if (open[w] == 0) continue;
-      open[w] &= ~(shifted(smeared, w, first) | shifted(smeared, w, second));
-      left |= open[w];
-    }
-    return left != 0;
+    return remove_taken(open.data(), open.size(), smeared + first / 64, first % 64, smeared + second / 64,
+                        second % 64) != 0;
   }
 
   /// Word w of the row moved towards lower places by `shift`.
   uint64_t shifted(const uint64_t* row, size_t w, int shift) const {
     const size_t from = w + static_cast<size_t>(shift / 64);
-    const int rest = shift % 64;
-    const uint64_t low = from < words_ ? row[from] : 0;
-    if (rest == 0) return low;
-    const uint64_t high = from + 1 < words_ ? row[from + 1] : 0;
-    return low >> rest | high << (64 - rest);
+    return from + 1 < words_ ? shifted_word(row + from, shift % 64) : 0;
+  }
+  static uint64_t shifted_word(const uint64_t* words, int rest) {
+    return words[0] >> rest | (words[1] << 1) << (63 - rest);
   }
 
+  static uint64_t remove_taken(uint64_t* open, size_t words, const uint64_t* first, int first_rest,
+                               const uint64_t* second, int second_rest);
+
   void refresh(int y) {
+    const size_t used = words_ - words_behind;
     for (size_t k = 1; k < levels_; ++k) {
       const uint64_t* below = level(y, k - 1);
       uint64_t* here = level(y, k);
-      for (size_t w = 0; w < words_; ++w) here[w] = below[w] | shifted(below, w, 1 << (k - 1));
+      for (size_t w = 0; w < used; ++w) here[w] = below[w] | shifted(below, w, 1 << (k - 1));
     }
     const uint64_t* row = level(y, 0);
     int longest = 0, current = 0;
@@ -294,6 +298,18 @@ class Bin {
   std::vector<uint64_t> bits_;
   std::vector<int> longest_free_;  ///< by row
 };
+
+/// Clears the bits of `open` that are set in one of two rows, which are moved; returns all that is left.
+BOOTH_VECTOR_CLONES
+uint64_t Bin::remove_taken(uint64_t* open, size_t words, const uint64_t* first, int first_rest, const uint64_t* second,
+                           int second_rest) {
+  uint64_t left = 0;
+  for (size_t w = 0; w < words; ++w) {
+    open[w] &= ~(shifted_word(first + w, first_rest) | shifted_word(second + w, second_rest));
+    left |= open[w];
+  }
+  return left;
+}
 
 struct Placement {
   int quarter_turns = 0;
@@ -369,7 +385,7 @@ std::optional<std::vector<Placed>> place_all(const std::vector<Piece>& pieces, d
     int best_top = side;
     for (int turn = 0; turn < 4; ++turn) {
       const Footprint& footprint = waiting[i].turns[static_cast<size_t>(turn)];
-      const auto place = bin.find(footprint, 0, best ? best_top - 1 : best_top);
+      const auto place = bin.find(footprint, best ? best_top - 1 : best_top);
       if (!place) continue;
       best_top = place->y + footprint.height;
       best = Placement{turn, *place, waiting[i].turns[0].width, waiting[i].turns[0].height};

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "pipeline/types/image.h"
+#include "pipeline/types/work.h"
 
 namespace booth {
 
@@ -22,7 +23,7 @@ using LightPyramid = std::vector<LightImage>;
 /// @param image  sRGB of 3 channels, or light
 /// @param valid  1 channel, the same size, not 0 where a pixel holds a colour; if it is 0 everywhere, all is grey
 /// Source: S. J. Gortler et al., "The Lumigraph", SIGGRAPH 1996, section 4.2 (pull-push).
-Pyramid push_pull(Image image, const Image& valid);
-LightPyramid push_pull(LightImage image, const Image& valid);
+Pyramid push_pull(Image image, Image valid, const Work& work = {});
+LightPyramid push_pull(LightImage image, Image valid, const Work& work = {});
 
 }  // namespace booth

@@ -221,7 +221,7 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& untextured, const Rig& rig,
   result.used_share = texels.used_share;
   result.positions = std::move(mesh.positions);
   result.atlas.uv = texture_coordinates(packing, options.size);
-  result.atlas.image = std::move(push_pull(std::move(texels.image), texels.painted).front());
+  result.atlas.image = std::move(push_pull(std::move(texels.image), std::move(texels.painted), work).front());
   work.report(1);
   return result;
 }

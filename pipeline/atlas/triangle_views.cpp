@@ -21,10 +21,13 @@ bool certainly_seen(const PreparedView& view, const std::array<uint32_t, 3>& tri
   // In pixels of the confidence map, with one more for interpolation and the band around the triangle.
   const int x0 = static_cast<int>(std::floor(0.5F * low.x())) - 1, x1 = static_cast<int>(0.5F * high.x()) + 1;
   const int y0 = static_cast<int>(std::floor(0.5F * low.y())) - 1, y1 = static_cast<int>(0.5F * high.y()) + 1;
-  if (!view.confidence.contains(x0, y0) || !view.confidence.contains(x1, y1)) return false;
-  for (int y = y0; y <= y1; ++y) {
-    const uint8_t* row = view.confidence.pixel(0, y);
-    if (std::any_of(row + x0, row + x1 + 1, [](uint8_t confidence) { return confidence < 255; })) return false;
+  if (!view.trust.contains(x0, y0) || !view.trust.contains(x1, y1)) return false;
+  constexpr uint32_t all_sure = 0xFFFFFFFF;
+  uint32_t common = all_sure;
+  for (int y = y0; y < y1; ++y) {
+    const TrustCell* row = view.trust.pixel(0, y);
+    for (int x = x0; x < x1; ++x) common &= row[x].confidence;
+    if (common != all_sure) return false;
   }
   return true;
 }

@@ -32,6 +32,14 @@ inline Floats pixel_at(const int16_t* p) {
       std::bit_cast<Integers>(__builtin_shufflevector(words, Words{}, 0, 4, 1, 5, 2, 6, 3, 7)), Floats);
 }
 
+/// Four samples of either sign.
+inline Floats signed_pixel_at(const int16_t* p) {
+  using Words = int16_t __attribute__((vector_size(8)));
+  Words words;
+  std::memcpy(&words, p, sizeof words);
+  return __builtin_convertvector(words, Floats);
+}
+
 /// Weights of the four pixels around a place that is `f` behind the second, in whole numbers.
 /// Source: R. Keys, "Cubic convolution interpolation for digital image processing", IEEE ASSP 29(6), 1981.
 struct CubicWeights {
@@ -59,13 +67,13 @@ inline constexpr auto cubic_weights = [] {
 /// The weighted sum of four pixels side by side, times CubicWeights::one.
 inline Floats weighted_row(const int16_t* pixels, const CubicWeights& weights) {
 #ifdef __SSE2__
-  const auto pair = [&](const int16_t* two, int16_t one, int16_t other) {
+  const __m128i all = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(weights.of.data()));
+  const auto pair = [](const int16_t* two, __m128i factors) {
     const __m128i both = _mm_loadu_si128(reinterpret_cast<const __m128i*>(two));
-    const __m128i factors = _mm_set1_epi32(static_cast<uint16_t>(one) | static_cast<int32_t>(other) * (1 << 16));
     return _mm_madd_epi16(_mm_unpacklo_epi16(both, _mm_unpackhi_epi64(both, both)), factors);
   };
   return _mm_cvtepi32_ps(
-      _mm_add_epi32(pair(pixels, weights.of[0], weights.of[1]), pair(pixels + 8, weights.of[2], weights.of[3])));
+      _mm_add_epi32(pair(pixels, _mm_shuffle_epi32(all, 0x00)), pair(pixels + 8, _mm_shuffle_epi32(all, 0x55))));
 #else
   Floats sum{};
   for (size_t c = 0; c < 4; ++c) {
@@ -105,9 +113,10 @@ inline Floats cubic(const LightPyramid& pyramid, float x, float y) {
   };
   const CubicWeights &across = weights(x - static_cast<float>(u0)), &along = weights(y - static_cast<float>(v0));
   const int16_t* row = image.pixel(u0 - 1, v0 - 1);
-  const ptrdiff_t down = 4 * static_cast<ptrdiff_t>(image.width);
-  Floats light{};
-  for (size_t j = 0; j < 4; ++j, row += down) light += static_cast<float>(along.of[j]) * weighted_row(row, across);
+  const size_t down = 4 * static_cast<size_t>(image.width);
+  const Floats factors = signed_pixel_at(along.of.data());
+  Floats light = factors[0] * weighted_row(row, across);
+  for (size_t j = 1; j < 4; ++j) light += factors[j] * weighted_row(row + j * down, across);
   constexpr float scale = 1.0F / CubicWeights::one / CubicWeights::one;
   light *= scale;
   return light > 0 ? light : Floats{};
@@ -121,15 +130,20 @@ inline Eigen::Array3f sample_level(const LightPyramid& pyramid, size_t level, fl
   return {light[0], light[1], light[2]};
 }
 
+/// How the pixels of level 0 are interpolated: bilinearly, or by cubic convolution, which keeps all detail.
+enum class Sharpness { usual, full };
+
 /// Linear light under a footprint of 2^lod pixels: between two levels, linearly, so that nothing aliases where a texel
 /// covers several pixels; by cubic convolution where it covers one or less. The last of four is not used.
 /// Source: L. Williams, "Pyramidal parametrics", SIGGRAPH 1983.
-inline Eigen::Array4f sample_pyramid(const LightPyramid& pyramid, float lod, float x, float y) {
+inline Eigen::Array4f sample_pyramid(const LightPyramid& pyramid, float lod, float x, float y,
+                                     Sharpness sharpness = Sharpness::full) {
   const float level = std::clamp(lod, 0.0F, static_cast<float>(pyramid.size() - 1));
   const auto fine = static_cast<size_t>(level);
   const float rest = level - static_cast<float>(fine);
   constexpr float negligible = 0.05F;
-  sampling::Floats light = fine == 0 ? sampling::cubic(pyramid, x, y) : sampling::bilinear(pyramid, fine, x, y);
+  sampling::Floats light = fine == 0 && sharpness == Sharpness::full ? sampling::cubic(pyramid, x, y)
+                                                                     : sampling::bilinear(pyramid, fine, x, y);
   if (rest >= negligible) light = (1 - rest) * light + rest * sampling::bilinear(pyramid, fine + 1, x, y);
   light /= full_light;
   return Eigen::Map<const Eigen::Array4f, Eigen::Aligned16>(&light[0]);
@@ -141,25 +155,26 @@ struct Trust {
   float confidence = 0;  ///< of PreparedView::confidence
 };
 
-/// Looks a surface point up in the depth and confidence maps by its pixel of level 0 and its depth.
-inline Trust look_up(const PreparedView& view, float x, float y, float depth_m) {
-  const float u = std::clamp(0.5F * x - 0.25F, 0.0F, static_cast<float>(view.depth.width - 1));
-  const float v = std::clamp(0.5F * y - 0.25F, 0.0F, static_cast<float>(view.depth.height - 1));
-  const int u0 = std::min(static_cast<int>(u), std::max(0, view.depth.width - 2));
-  const int v0 = std::min(static_cast<int>(v), std::max(0, view.depth.height - 2));
-  const ptrdiff_t right = view.depth.width > 1 ? 1 : 0, down = view.depth.height > 1 ? view.depth.width : 0;
-  const float* depth = view.depth.pixel(u0, v0);
-  const float surface_m = std::max(std::max(depth[0], depth[right]), std::max(depth[down], depth[down + right]));
-  // Fully visible up to half the bias behind the depth map, hidden from one and a half of it.
+/// Looks a surface point up by its pixel of level 0 and its depth. Without branches, so that the compiler can do it for
+/// several points at once.
+inline Trust look_up(const TrustCell* cells, int width, int height, float x, float y, float depth_m) {
+  const float u = std::min(std::max(0.0F, 0.5F * x - 0.25F), static_cast<float>(width - 1));
+  const float v = std::min(std::max(0.0F, 0.5F * y - 0.25F), static_cast<float>(height - 1));
+  const int u0 = static_cast<int>(u), v0 = static_cast<int>(v);
+  const TrustCell& cell = cells[v0 * width + u0];
+  // Fully visible up to half the bias behind the surface, hidden from one and a half of it.
   constexpr float bias_m = 0.012F;
-  const float visible = std::clamp(1.5F - (depth_m - surface_m) / bias_m, 0.0F, 1.0F);
-  if (visible <= 0) return {};
+  const float visible = std::min(std::max(0.0F, 1.5F - (depth_m - cell.surface_m) / bias_m), 1.0F);
   const float fu = u - static_cast<float>(u0), fv = v - static_cast<float>(v0);
-  const uint8_t* sure = view.confidence.pixel(u0, v0);
-  const auto between = [fu](uint8_t here, uint8_t beside) {
-    return (1 - fu) * static_cast<float>(here) + fu * static_cast<float>(beside);
+  const auto sure = [&](int corner) {
+    return static_cast<float>(static_cast<int32_t>(cell.confidence >> (8 * corner) & 255));
   };
-  return {visible, ((1 - fv) * between(sure[0], sure[right]) + fv * between(sure[down], sure[down + right])) / 255};
+  const float above = (1 - fu) * sure(0) + fu * sure(1), below = (1 - fu) * sure(2) + fu * sure(3);
+  return {visible, ((1 - fv) * above + fv * below) * (1.0F / 255)};
+}
+
+inline Trust look_up(const PreparedView& view, float x, float y, float depth_m) {
+  return look_up(view.trust.samples.data(), view.trust.width, view.trust.height, x, y, depth_m);
 }
 
 }  // namespace booth
