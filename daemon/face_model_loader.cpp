@@ -1,6 +1,12 @@
 #include "daemon/face_model_loader.h"
 
+#include <fcntl.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
 #include <fstream>
+#include <span>
 #include <utility>
 
 #include "pipeline/face/landmark_predictor.h"
@@ -9,10 +15,38 @@
 namespace booth {
 namespace {
 
+/// A file's bytes, mapped as long as it lives; without a copy of 100 MB.
+class MappedFile {
+ public:
+  /// Maps nothing where the file cannot be opened, or is empty or no file.
+  explicit MappedFile(const std::filesystem::path& path) {
+    const int fd = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
+    if (fd < 0) return;
+    struct stat status {};
+    if (::fstat(fd, &status) == 0 && S_ISREG(status.st_mode) && status.st_size > 0) {
+      const auto size = static_cast<size_t>(status.st_size);
+      void* const begin = ::mmap(nullptr, size, PROT_READ, MAP_PRIVATE | MAP_POPULATE, fd, 0);
+      if (begin != MAP_FAILED) bytes_ = {static_cast<const uint8_t*>(begin), size};
+    }
+    ::close(fd);
+  }
+  ~MappedFile() {
+    if (!bytes_.empty()) ::munmap(const_cast<uint8_t*>(bytes_.data()), bytes_.size());
+  }
+  MappedFile(const MappedFile&) = delete;
+  MappedFile& operator=(const MappedFile&) = delete;
+
+  std::span<const uint8_t> bytes() const { return bytes_; }
+
+ private:
+  std::span<const uint8_t> bytes_;
+};
+
 Result<FaceModel> load(const std::filesystem::path& landmark_model) {
-  std::ifstream file(landmark_model, std::ios::binary);
-  if (!file) return Error{ErrorCode::not_found, landmark_model.string() + ": the model of landmarks cannot be opened"};
-  auto landmarks = read_dlib_landmarks(file);
+  const MappedFile file(landmark_model);
+  if (file.bytes().empty())
+    return Error{ErrorCode::not_found, landmark_model.string() + ": the model of landmarks cannot be read"};
+  auto landmarks = read_dlib_landmarks(file.bytes());
   if (!landmarks) return Error{landmarks.error().code, landmark_model.string() + ": " + landmarks.error().message};
   auto neutral = parse_neutral_head(built_in_neutral_head());
   if (!neutral) return neutral.error();

@@ -68,7 +68,8 @@ struct CaptureFrames {
   std::optional<Mesh> face_scan = {};        ///< another scanner's face, see place_external_scan; used before `face`
 };
 
-/// What the passive face needs besides a capture. It takes a second to load and serves any number of reconstructions.
+/// What the passive face needs besides a capture. It loads in a tenth of a second and serves any number of
+/// reconstructions.
 struct FaceModel {
   std::shared_ptr<const LandmarkPredictor> landmarks;  ///< never null
   std::shared_ptr<const NeutralHead> neutral;          ///< never null

@@ -23,10 +23,10 @@ struct ColladaOptions {
 /// geometry instance.
 ///
 /// Morph targets, where asked for, are a geometry each, named as they are, and one morph controller whose source is the
-/// mesh, as is the skin's. Were they chained, the scene's skin to the morph and the morph to the mesh, Blender 3.4, three.js
-/// and pycollada would find no mesh at all. Beside each other, Blender shows the targets as shape keys of the skinned
-/// mesh, and the others, which know none, the skinned mesh. Assimp 5.2 refuses any document with a morph controller. A
-/// target takes a third of the space that everything else does.
+/// mesh, as is the skin's. Were they chained, the scene's skin to the morph and the morph to the mesh, Blender 3.4,
+/// three.js and pycollada would find no mesh at all. Beside each other, Blender shows the targets as shape keys of the
+/// skinned mesh, and the others, which know none, the skinned mesh. Assimp 5.2 refuses any document with a morph
+/// controller. A target takes a third of the space that everything else does.
 /// @param clips  written as one animation, one clip after the other, as most readers know only one timeline; each has
 /// to
 ///               begin as the one before it ends, and to move the same joints

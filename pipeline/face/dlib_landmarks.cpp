@@ -1,14 +1,32 @@
-#include <dlib/image_processing.h>
-#include <dlib/image_processing/frontal_face_detector.h>
+#include <dlib/image_processing/object_detector.h>
+#include <dlib/image_processing/scan_fhog_pyramid.h>
+#include <dlib/image_transforms/image_pyramid.h>
 
 #include <algorithm>
-#include <exception>
-#include <istream>
+#include <sstream>
+#include <string>
+#include <utility>
 
 #include "pipeline/face/landmark_predictor.h"
+#include "pipeline/face/regression_trees.h"
+
+// The detector as the assembler put it into the program (frontal_detector_data.S).
+extern "C" {
+extern const char booth_frontal_detector[], booth_frontal_detector_end[];
+}
 
 namespace booth {
 namespace {
+
+/// dlib's frontal_face_detector, without the header that holds its weights.
+using FrontalDetector = dlib::object_detector<dlib::scan_fhog_pyramid<dlib::pyramid_down<6>>>;
+
+FrontalDetector frontal_detector() {
+  std::istringstream saved(std::string(booth_frontal_detector, booth_frontal_detector_end));
+  FrontalDetector detector;
+  dlib::deserialize(detector, saved);
+  return detector;
+}
 
 dlib::array2d<unsigned char> to_dlib(const Image& grey) {
   dlib::array2d<unsigned char> image(grey.height, grey.width);
@@ -18,14 +36,14 @@ dlib::array2d<unsigned char> to_dlib(const Image& grey) {
 
 class DlibLandmarks : public LandmarkPredictor {
  public:
-  DlibLandmarks(dlib::frontal_face_detector detector, dlib::shape_predictor predictor)
-      : detector_(std::move(detector)), predictor_(std::move(predictor)) {}
+  DlibLandmarks(FrontalDetector detector, RegressionTrees trees)
+      : detector_(std::move(detector)), trees_(std::move(trees)) {}
 
   std::vector<DetectedFace> detect(const Image& grey) const override {
     // Faces that are turned or badly lit score below the detector's own threshold, as do things that are no faces;
     // several cameras together tell them apart.
     constexpr double below_threshold = -0.5;
-    dlib::frontal_face_detector detector = detector_;  // it keeps its scratch space within
+    FrontalDetector detector = detector_;  // it keeps its scratch space within
     std::vector<std::pair<double, dlib::rectangle>> found;
     detector(to_dlib(grey), found, below_threshold);
     std::vector<DetectedFace> faces;
@@ -40,36 +58,20 @@ class DlibLandmarks : public LandmarkPredictor {
   }
 
   FaceLandmarks predict(const Image& grey, const Eigen::AlignedBox2d& box) const override {
-    const auto whole = [](double value) { return std::lround(value); };
-    const dlib::rectangle face(whole(box.min().x()), whole(box.min().y()), whole(box.max().x()), whole(box.max().y()));
-    const dlib::full_object_detection shape = predictor_(to_dlib(grey), face);
-    FaceLandmarks landmarks;
-    for (size_t i = 0; i < landmarks.size(); ++i) {
-      const dlib::point& part = shape.part(i);
-      landmarks[i] = {static_cast<double>(part.x()), static_cast<double>(part.y())};
-    }
-    return landmarks;
+    return predict_landmarks(trees_, grey, box);
   }
 
  private:
-  dlib::frontal_face_detector detector_;
-  dlib::shape_predictor predictor_;
+  FrontalDetector detector_;
+  RegressionTrees trees_;
 };
 
 }  // namespace
 
-Result<std::unique_ptr<LandmarkPredictor>> read_dlib_landmarks(std::istream& model) {
-  dlib::shape_predictor predictor;
-  try {
-    dlib::deserialize(predictor, model);
-  } catch (const std::exception& fault) {
-    return Error{ErrorCode::invalid_file, std::string("no shape predictor of dlib's: ") + fault.what()};
-  }
-  if (predictor.num_parts() != face_landmarks)
-    return Error{ErrorCode::invalid_file, "the shape predictor has " + std::to_string(predictor.num_parts()) +
-                                              " landmarks, expected " + std::to_string(face_landmarks)};
-  return std::unique_ptr<LandmarkPredictor>(
-      std::make_unique<DlibLandmarks>(dlib::get_frontal_face_detector(), std::move(predictor)));
+Result<std::unique_ptr<LandmarkPredictor>> read_dlib_landmarks(std::span<const uint8_t> model) {
+  auto trees = read_regression_trees(model);
+  if (!trees) return trees.error();
+  return std::unique_ptr<LandmarkPredictor>(std::make_unique<DlibLandmarks>(frontal_detector(), std::move(*trees)));
 }
 
 }  // namespace booth

@@ -8,15 +8,13 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <filesystem>
-#include <fstream>
 #include <memory>
-#include <sstream>
 #include <tuple>
-#include <utility>
 
 #include "pipeline/face/landmark_predictor.h"
 #include "pipeline/geometry/camera_model.h"
 #include "replay/recording.h"
+#include "tests/quality/landmark_model.h"
 #include "tests/quality/measures.h"
 #include "tests/quality/truth.h"
 
@@ -25,23 +23,21 @@ namespace {
 
 using ::testing::HasSubstr;
 
-constexpr const char* model = "/usr/share/dlib/shape_predictor_68_face_landmarks.dat";
-
 /// The head of the small recording's hull.
 HeadRegion head() { return {.barycentre = {0.004F, 1.614F, 0.062F}, .neck_y = 1.513F, .crown_y = 1.714F}; }
 
 class ControlPoints : public testing::Test {
  protected:
   static void SetUpTestSuite() {
-    if (std::ifstream file(model, std::ios::binary); file) predictor_ = read_dlib_landmarks(file).value().release();
+    predictor_ = read_landmarks();
     folder_ = *find_recording("mini");
     const auto recording = read_recording(folder_);
     rig_ = recording->rig;
     frames_ = load_shot(*recording, *recording->find(ShotRole::body), {}).sets.front().frames;
   }
-  static void TearDownTestSuite() { delete std::exchange(predictor_, nullptr); }
+  static void TearDownTestSuite() { predictor_.reset(); }
   void SetUp() override {
-    if (predictor_ == nullptr) GTEST_SKIP() << "no model of landmarks: " << model;
+    if (predictor_ == nullptr) GTEST_SKIP() << "no model of landmarks: " << installed_landmark_model;
   }
 
   static std::vector<Frame> frames_of(const std::vector<std::string>& cameras) {
@@ -61,7 +57,7 @@ class ControlPoints : public testing::Test {
     return distances[distances.size() / 2];
   }
 
-  inline static LandmarkPredictor* predictor_ = nullptr;
+  inline static std::shared_ptr<const LandmarkPredictor> predictor_;
   inline static std::filesystem::path folder_;
   inline static Rig rig_;
   inline static std::vector<Frame> frames_;
@@ -156,8 +152,8 @@ TEST_F(ControlPoints, SayWhenNoCameraSeesTheFaceFromTheFront) {
 }
 
 TEST(DlibLandmarks, RefuseWhatIsNoModel) {
-  std::istringstream nothing, nonsense("not a model at all");
-  EXPECT_EQ(read_dlib_landmarks(nothing).error().code, ErrorCode::invalid_file);
+  const std::vector<uint8_t> nonsense{'n', 'o', ' ', 'm', 'o', 'd', 'e', 'l'};
+  EXPECT_EQ(read_dlib_landmarks({}).error().code, ErrorCode::invalid_file);
   EXPECT_EQ(read_dlib_landmarks(nonsense).error().code, ErrorCode::invalid_file);
 }
 

@@ -8,7 +8,6 @@
 #include <array>
 #include <cmath>
 #include <exception>
-#include <fstream>
 #include <iostream>
 #include <memory>
 #include <stdexcept>
@@ -20,6 +19,7 @@
 #include "pipeline/reconstruct.h"
 #include "pipeline/thread_pool.h"
 #include "replay/recording.h"
+#include "tests/quality/landmark_model.h"
 #include "tests/quality/measures.h"
 #include "tests/quality/panels.h"
 
@@ -44,10 +44,9 @@ CaptureFrames load_capture(const std::filesystem::path& folder, const Work& work
 }
 
 FaceModel read_model(const std::string& landmarks) {
-  std::ifstream file(landmarks, std::ios::binary);
-  if (!file) throw std::runtime_error(landmarks + " cannot be opened");
-  return {read_dlib_landmarks(file).value(),
-          std::make_shared<const NeutralHead>(*parse_neutral_head(built_in_neutral_head()))};
+  auto predictor = read_landmarks(landmarks);
+  if (!predictor) throw std::runtime_error(landmarks + " cannot be opened");
+  return {std::move(predictor), std::make_shared<const NeutralHead>(*parse_neutral_head(built_in_neutral_head()))};
 }
 
 /// The shape alone, as plaster lit from above the camera's left.

@@ -7,7 +7,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <fstream>
 #include <memory>
 #include <numbers>
 #include <optional>
@@ -19,6 +18,7 @@
 #include "pipeline/thread_pool.h"
 #include "replay/recording.h"
 #include "tests/quality/face_scan.h"
+#include "tests/quality/landmark_model.h"
 #include "tests/quality/measures.h"
 #include "tests/quality/truth.h"
 
@@ -157,10 +157,9 @@ TEST_P(FaceSurface, IsTheHullsWhereThePatternsAreSpoilt) {
 }
 
 TEST_P(FaceSurface, IsThePassiveOneWhereThePatternsAreSpoiltAndThereIsAModel) {
-  constexpr const char* model_file = "/usr/share/dlib/shape_predictor_68_face_landmarks.dat";
-  std::ifstream file(model_file, std::ios::binary);
-  if (!file) GTEST_SKIP() << "no model of landmarks: " << model_file;
-  const FaceModel model{read_dlib_landmarks(file).value(),
+  auto predictor = read_landmarks();
+  if (!predictor) GTEST_SKIP() << "no model of landmarks: " << installed_landmark_model;
+  const FaceModel model{std::move(predictor),
                         std::make_shared<const NeutralHead>(*parse_neutral_head(built_in_neutral_head()))};
   int asked = 0;
   const auto made = made_with(without_patterns(), {[&] {

@@ -7,7 +7,6 @@
 
 #include <algorithm>
 #include <filesystem>
-#include <fstream>
 #include <memory>
 #include <utility>
 
@@ -16,6 +15,7 @@
 #include "pipeline/thread_pool.h"
 #include "replay/recording.h"
 #include "tests/quality/face_truth.h"
+#include "tests/quality/landmark_model.h"
 #include "tests/quality/measures.h"
 #include "tests/quality/truth.h"
 
@@ -25,8 +25,6 @@ namespace {
 namespace fs = std::filesystem;
 using ::testing::Contains;
 using ::testing::HasSubstr;
-
-constexpr const char* model_file = "/usr/share/dlib/shape_predictor_68_face_landmarks.dat";
 
 /// True points of the face: what the face cameras see, or of the true mesh where the recording has no such points.
 std::vector<Eigen::Vector3d> face_points(const fs::path& recording) {
@@ -58,13 +56,11 @@ FaceError face_error(const std::vector<Eigen::Vector3d>& points, const Mesh& ava
 class PassiveFace : public testing::Test {
  protected:
   static void SetUpTestSuite() {
-    if (std::ifstream file(model_file, std::ios::binary); file)
-      model_ = new FaceModel{read_dlib_landmarks(file).value(),
-                             std::make_shared<const NeutralHead>(*parse_neutral_head(built_in_neutral_head()))};
+    model_ = {read_landmarks(), std::make_shared<const NeutralHead>(*parse_neutral_head(built_in_neutral_head()))};
   }
-  static void TearDownTestSuite() { delete std::exchange(model_, nullptr); }
+  static void TearDownTestSuite() { model_ = {}; }
   void SetUp() override {
-    if (model_ == nullptr) GTEST_SKIP() << "no model of landmarks: " << model_file;
+    if (!model_.landmarks) GTEST_SKIP() << "no model of landmarks: " << installed_landmark_model;
   }
 
   /// @param without  cameras that took no picture
@@ -82,10 +78,10 @@ class PassiveFace : public testing::Test {
     });
     ReconstructionOptions options;
     options.face = face;
-    return reconstruct(std::move(capture), options, {[] { return Result<FaceModel>(*model_); }, {}}, work);
+    return reconstruct(std::move(capture), options, {[] { return Result<FaceModel>(model_); }, {}}, work);
   }
 
-  inline static FaceModel* model_ = nullptr;
+  inline static FaceModel model_;
 };
 
 struct Bounds {
