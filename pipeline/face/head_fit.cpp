@@ -201,11 +201,11 @@ class DisplacementSolver {
     factor_.factorize(energy_ + pulled);
   }
 
-  void solve(const std::vector<Pull>& pulls, Positions* displacement) const {
+  /// @param precision  of the forces that are left, as a share of the pulls
+  void solve(const std::vector<Pull>& pulls, double precision, Positions* displacement) const {
     Positions right = Positions::Zero(energy_.rows(), 3);
     for (const Pull& pull : pulls) add(pull, pull.information * pull.wanted, &right);
     Positions residual = right - apply(pulls, *displacement);
-    constexpr double precision = 1e-3;
     const double enough = precision * right.norm();
     Positions improved = solve_factored(residual), direction = improved;
     double progress = residual.cwiseProduct(improved).sum();
@@ -353,12 +353,14 @@ class HeadOutline {
 };
 
 /// The head in all views that see the whole of it.
-std::vector<HeadOutline> head_outlines(const SilhouetteViews& views, const Mesh& head) {
+std::vector<HeadOutline> head_outlines(const SilhouetteViews& views, const Mesh& head, const Work& work) {
+  std::vector<std::optional<HeadOutline>> seen(views.size());
+  work.parallel_for(views.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; ++i) seen[i].emplace(*views[i], head);
+  });
   std::vector<HeadOutline> outlines;
-  for (const auto& view : views) {
-    HeadOutline outline(*view, head);
-    if (outline.whole()) outlines.push_back(std::move(outline));
-  }
+  for (auto& outline : seen)
+    if (outline->whole()) outlines.push_back(std::move(*outline));
   return outlines;
 }
 
@@ -383,33 +385,40 @@ std::optional<double> distance_at(const Field& hull, const Eigen::Vector3d& p) {
   return sum;
 }
 
-/// How far a hull is from every vertex along its normal, metres: the last step that is inside it.
+/// How far a hull is from every vertex of the face along its normal, metres: the last step that is inside it.
 /// @param inside  whether a point is
 template <class Inside>
-std::vector<float> gaps_along_normals(const Mesh& head, const std::vector<Eigen::Vector3f>& normals, Inside&& inside) {
+std::vector<float> gaps_along_normals(const NeutralHead& neutral, const Mesh& head,
+                                      const std::vector<Eigen::Vector3f>& normals, const Work& work, Inside&& inside) {
   std::vector<float> gaps(head.positions.size(), 0);
   constexpr float first_m = 0.001F, farthest_m = 0.03F, growth = 1.25F;
-  for (size_t i = 0; i < gaps.size(); ++i)
-    for (float step = first_m; step < farthest_m && inside(head.positions[i] + step * normals[i]); step *= growth)
-      gaps[i] = step;
+  constexpr size_t at_once = 256;
+  work.parallel_for(gaps.size(), at_once, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; ++i) {
+      if (neutral.face_front[i] == 0) continue;
+      for (float step = first_m; step < farthest_m && inside(head.positions[i] + step * normals[i]); step *= growth)
+        gaps[i] = step;
+    }
+  });
   return gaps;
 }
 
 /// How far the visual hull of a head by itself is from it: what its cameras cannot see of its hollows.
-std::vector<float> own_hull_gaps(const std::vector<HeadOutline>& outlines, const Mesh& head,
-                                 const std::vector<Eigen::Vector3f>& normals) {
-  return gaps_along_normals(head, normals, [&](const Eigen::Vector3f& p) {
+std::vector<float> own_hull_gaps(const NeutralHead& neutral, const std::vector<HeadOutline>& outlines, const Mesh& head,
+                                 const std::vector<Eigen::Vector3f>& normals, const Work& work) {
+  return gaps_along_normals(neutral, head, normals, work, [&](const Eigen::Vector3f& p) {
     return std::all_of(outlines.begin(), outlines.end(), [&](const HeadOutline& o) { return o.covers(p); });
   });
 }
 
 /// How much farther out than it would be if the head were bare the hull is: hair, glasses, a hand. In 0 … 1, 1 = bare.
 std::vector<float> bareness(const NeutralHead& neutral, const SilhouetteViews& views, const Mesh& aligned,
-                            const Field& hull, const Mesh& head) {
+                            const Field& hull, const Mesh& head, const Work& work) {
   const std::vector<Eigen::Vector3f> normals = vertex_normals(head);
   // Of the head before it was bent: where it was drawn towards hair it has hollows that no face has.
-  const std::vector<float> expected = own_hull_gaps(head_outlines(views, aligned), aligned, vertex_normals(aligned));
-  const std::vector<float> found = gaps_along_normals(head, normals, [&](const Eigen::Vector3f& p) {
+  const std::vector<float> expected =
+      own_hull_gaps(neutral, head_outlines(views, aligned, work), aligned, vertex_normals(aligned), work);
+  const std::vector<float> found = gaps_along_normals(neutral, head, normals, work, [&](const Eigen::Vector3f& p) {
     const Grid& grid = hull.grid();
     const Eigen::Vector3f at = (p - grid.origin.cast<float>()) / static_cast<float>(grid.voxel_m);
     const Eigen::Vector3i near = at.array().round().cast<int>();
@@ -434,32 +443,49 @@ class OutlinePulls {
   /// @param aligned  where the displacements begin
   /// @return how many hold (the others only stop)
   size_t add(const Positions& aligned, const Mesh& head, const std::vector<HeadOutline>& outlines,
-             const std::vector<Eigen::Vector3f>& normals, std::vector<Pull>* pulls) const {
+             const std::vector<Eigen::Vector3f>& normals, const Work& work, std::vector<Pull>* pulls) const {
+    struct OfView {
+      size_t held = 0;
+      std::vector<Pull> pulls;
+    };
+    std::vector<OfView> of_views(outlines.size());
+    work.parallel_for(outlines.size(), 1, [&](size_t begin, size_t end) {
+      for (size_t i = begin; i < end; ++i)
+        of_views[i].held = add_view(aligned, head, outlines[i], normals, &of_views[i].pulls);
+    });
     size_t held = 0;
-    for (const HeadOutline& outline : outlines) {
-      const SilhouetteView* view = &outline.view();
-      const std::vector<uint8_t> rim = rim_vertices(view->camera().center().cast<float>(), head);
-      for (size_t i = 0; i < head.positions.size(); ++i) {
-        if (!shows_skin(i)) continue;
-        const Eigen::Vector3f& p = head.positions[i];
-        const float outside = view->distance_m(p);
-        if (std::isnan(outside)) continue;
-        const bool holds = rim[i] != 0 && outline.on_outline(i, p, normals[i]);
-        if (!holds && outside <= 0) continue;
-        const Eigen::Vector3d slope = gradient(*view, p);
-        if (slope.norm() < 0.5 || slope.norm() > 2) continue;
-        const Eigen::Vector3d way = slope.normalized();
-        constexpr double alike = 0.7;
-        if (holds && way.dot(normals[i].cast<double>()) < alike) continue;
-        const double residual = static_cast<double>(outside) / slope.norm();
-        pulls->push_back(pull(*view, i, p, way, residual, aligned));
-        held += holds ? 1 : 0;
-      }
+    for (const OfView& of_view : of_views) {
+      held += of_view.held;
+      pulls->insert(pulls->end(), of_view.pulls.begin(), of_view.pulls.end());
     }
     return held;
   }
 
  private:
+  size_t add_view(const Positions& aligned, const Mesh& head, const HeadOutline& outline,
+                  const std::vector<Eigen::Vector3f>& normals, std::vector<Pull>* pulls) const {
+    size_t held = 0;
+    const SilhouetteView& view = outline.view();
+    const std::vector<uint8_t> rim = rim_vertices(view.camera().center().cast<float>(), head);
+    for (size_t i = 0; i < head.positions.size(); ++i) {
+      if (!shows_skin(i)) continue;
+      const Eigen::Vector3f& p = head.positions[i];
+      const float outside = view.distance_m(p);
+      if (std::isnan(outside)) continue;
+      const bool holds = rim[i] != 0 && outline.on_outline(i, p, normals[i]);
+      if (!holds && outside <= 0) continue;
+      const Eigen::Vector3d slope = gradient(view, p);
+      if (slope.norm() < 0.5 || slope.norm() > 2) continue;
+      const Eigen::Vector3d way = slope.normalized();
+      constexpr double alike = 0.7;
+      if (holds && way.dot(normals[i].cast<double>()) < alike) continue;
+      const double residual = static_cast<double>(outside) / slope.norm();
+      pulls->push_back(pull(view, i, p, way, residual, aligned));
+      held += holds ? 1 : 0;
+    }
+    return held;
+  }
+
   bool shows_skin(size_t vertex) const {
     const HeadPart part = neutral_.part[vertex];
     return neutral_.face_front[vertex] != 0 &&
@@ -671,17 +697,19 @@ size_t bend_smoothly(const NeutralHead& neutral, const std::vector<Target>& targ
     if (round >= first_with_outlines && round <= last_new_outlines) {
       silhouette_pulls.clear();
       const std::vector<Eigen::Vector3f> normals = vertex_normals(*head);
-      const std::vector<HeadOutline> outlines = head_outlines(views, *head);
-      held = outline_pulls.add(aligned, *head, outlines, normals, &silhouette_pulls);
+      const std::vector<HeadOutline> outlines = head_outlines(views, *head, work);
+      held = outline_pulls.add(aligned, *head, outlines, normals, work, &silhouette_pulls);
       if (!outlines.empty())
-        hull_pulls.add(aligned, *head, own_hull_gaps(outlines, *head, normals), normals, &silhouette_pulls);
+        hull_pulls.add(aligned, *head, own_hull_gaps(neutral, outlines, *head, normals, work), normals,
+                       &silhouette_pulls);
     }
     pulls.insert(pulls.end(), silhouette_pulls.begin(), silhouette_pulls.end());
     if (round >= first_with_pictures)
       add_picture_pulls(neutral, pictures, similarity, round < first_near, displacement, *head, work, &pulls);
     // Those of later rounds are much alike.
     if (round <= first_with_pictures) solver.precondition(pulls);
-    solver.solve(pulls, &displacement);
+    constexpr double rough = 1e-2, fine = 1e-3;  // the next round improves on a rough one
+    solver.solve(pulls, round + 1 < rounds ? rough : fine, &displacement);
     set_positions(aligned + displacement, head);
   }
   return held;
@@ -736,7 +764,7 @@ Result<FittedHead> fit_neutral_head(const NeutralHead& neutral, const FaceContro
   else
     fitted.outline_points =
         bend_smoothly(neutral, targets, pictures, views, hull, similarity, options, work, &fitted.mesh);
-  const std::vector<float> bare = bareness(neutral, views, aligned, hull, fitted.mesh);
+  const std::vector<float> bare = bareness(neutral, views, aligned, hull, fitted.mesh, work);
   for (size_t i = 0; i < bare.size(); ++i) fitted.bare.push_back(fitted.face[i] != 0 ? bare[i] : 0);
   if (work.stopped()) return Work::cancelled();
 
