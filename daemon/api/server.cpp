@@ -535,7 +535,10 @@ void Server::Content::answer(Pending& request, const Answer& given) {
                           std::chrono::duration<double>(SteadyClock::now() - request.received).count());
   if (!given) {
     booth.metrics().add("requests_failed");
-    spdlog::debug("{}: {}", method, given.error().message);
+    // A refusal may repeat what the client wrote, which may be somebody's name.
+    const ErrorCode code = given.error().code;
+    const bool of_client = code == ErrorCode::invalid_argument || code == ErrorCode::not_found;
+    spdlog::debug("{}: {}", method, of_client ? std::string(rpc_error(code).kind) : given.error().message);
     if (!request.notification)
       send(*request.socket, request.envelope,
            error_text(request.id, rpc_error(given.error().code), given.error().message), {});

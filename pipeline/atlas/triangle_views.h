@@ -27,7 +27,7 @@ struct TriangleView {
   void for_each(const std::array<std::array<float, places>, 3>& corner_weights, size_t count,
                 std::array<float, places>* rating_at, std::array<float, places>* x, std::array<float, places>* y,
                 std::array<float, places>* z) const {
-    const auto& [a, b, c] = corner_weights;
+    const std::array<float, places>&a = corner_weights[0], &b = corner_weights[1], &c = corner_weights[2];
     const auto interpolated = [&](const std::array<float, 3>& corners, size_t i) {
       return a[i] * corners[0] + b[i] * corners[1] + c[i] * corners[2];
     };

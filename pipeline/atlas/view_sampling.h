@@ -146,7 +146,7 @@ inline Eigen::Array4f sample_pyramid(const LightPyramid& pyramid, float lod, flo
                                                                      : sampling::bilinear(pyramid, fine, x, y);
   if (rest >= negligible) light = (1 - rest) * light + rest * sampling::bilinear(pyramid, fine + 1, x, y);
   light /= full_light;
-  return Eigen::Map<const Eigen::Array4f, Eigen::Aligned16>(&light[0]);
+  return {light[0], light[1], light[2], light[3]};
 }
 
 /// What is known about a surface point in a camera; both 0 … 1.

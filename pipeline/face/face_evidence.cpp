@@ -64,10 +64,10 @@ FaceEvidence weigh_face(std::span<const FacePicture> seen, const FaceControlPoin
   FaceEvidence evidence;
   evidence.outside_outline = share_outside(fitted, views);
   std::vector<PinholePicture> pictures;  // of cameras that know a face when they see it
-  for (const auto& [picture, matte] : seen)
+  for (const FacePicture& face : seen)
     if (std::any_of(controls.observations.begin(), controls.observations.end(),
-                    [&](const FaceObservation& observation) { return observation.camera == picture.view.id; }))
-      pictures.push_back(picture);
+                    [&](const FaceObservation& observation) { return observation.camera == face.pinhole.view.id; }))
+      pictures.push_back(face.pinhole);
   if (pictures.size() < 2) return evidence;
   const auto frontal = [&](const PinholePicture& picture) {
     return (picture.view.center() - controls.frame.middle).normalized().dot(controls.frame.forward);

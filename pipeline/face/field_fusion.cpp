@@ -67,7 +67,8 @@ Field rewrite(const Field& field, const Eigen::AlignedBox3f& box, const Eigen::V
   reach.extend(box.max() + towards);
 
   // New samples of the bricks in reach, and what each brick is then.
-  const auto [nx, ny, nz] = field.bricks();
+  const auto bricks = field.bricks();
+  const int nx = bricks[0], ny = bricks[1], nz = bricks[2];
   std::vector<std::vector<float>> changed(static_cast<size_t>(nx) * static_cast<size_t>(ny) * static_cast<size_t>(nz));
   work.parallel_for(static_cast<size_t>(nz) * static_cast<size_t>(ny), 1, [&](size_t begin, size_t end) {
     for (size_t row = begin; row < end && !work.stopped(); ++row) {

@@ -1,12 +1,7 @@
-#include <gmock/gmock.h>
-#include <signal.h>
-#include <sys/wait.h>
-#include <unistd.h>
-
 #include <random>
 #include <set>
 
-#include "tests/daemon/test_booth.h"
+#include "tests/daemon/booth_programs.h"
 
 namespace booth::test {
 namespace {
@@ -16,73 +11,6 @@ using testing::SizeIs;
 
 /// What is said of a capture that ended with the process.
 constexpr const char* interrupted = "the booth was stopped while capturing";
-
-/// The real programs, as processes of their own.
-class Process : public TestBooth {
- protected:
-  void SetUp() override {
-    TestBooth::SetUp();
-    config_ = folder_.path() / "boothd.toml";
-    std::ofstream(config_) << write_config(options_.config);
-  }
-  void TearDown() override {
-    if (boothd_ > 0) ::kill(boothd_, SIGKILL), wait_exit();
-  }
-
-  /// What it says goes to a file; a daemon's log too.
-  static pid_t spawn(const std::vector<std::string>& command, const fs::path& output, bool log = false) {
-    const pid_t pid = ::fork();
-    if (pid != 0) return pid;
-    std::vector<char*> arguments;
-    for (const std::string& argument : command) arguments.push_back(const_cast<char*>(argument.c_str()));
-    arguments.push_back(nullptr);
-    if (::freopen(output.c_str(), "a", stdout) != nullptr && (!log || ::dup2(STDOUT_FILENO, STDERR_FILENO) >= 0))
-      ::execv(arguments[0], arguments.data());
-    ::_exit(127);
-  }
-  /// Its exit status, and what it wrote.
-  std::pair<int, std::string> run(std::vector<std::string> command) {
-    const fs::path output = folder_.path() / "output";
-    fs::remove(output);
-    int status = 0;
-    ::waitpid(spawn(command, output), &status, 0);
-    std::ifstream file(output);
-    return {WIFEXITED(status) ? WEXITSTATUS(status) : -1, std::string((std::istreambuf_iterator<char>(file)), {})};
-  }
-  std::pair<int, std::string> boothctl(const std::vector<std::string>& arguments) {
-    std::vector<std::string> command{
-        BOOTHCTL, "--control", options_.config.api.control, "--events", options_.config.api.events, "--timeout", "30"};
-    command.insert(command.end(), arguments.begin(), arguments.end());
-    return run(command);
-  }
-  void start_boothd() {
-    boothd_ = spawn({BOOTHD, "--config", config_, "--reconstruct", reconstruct_.path()}, folder_.path() / "log", true);
-    client_ = std::make_unique<RawClient>(options_.config.api.control);
-    ASSERT_TRUE(wait_until([&] { return call("system.status")["ready"] == true; }));
-  }
-  int wait_exit() {
-    int status = 0;
-    ::waitpid(boothd_, &status, 0);
-    boothd_ = -1;
-    return status;
-  }
-  void expect_all_whole() {
-    for (const std::string& id : entries(options_.config.booth.recordings())) {
-      if (id.starts_with(".")) continue;  // nobody takes it for a recording
-      const auto recording = read_recording(options_.config.booth.recordings() / id);
-      ASSERT_TRUE(recording) << recording.error().message;
-      for (const Shot& shot : recording->shots) EXPECT_THAT(load_shot(*recording, shot).faults, IsEmpty());
-    }
-    for (const std::string& id : entries(options_.config.booth.avatars())) {
-      if (!id.starts_with(".")) {
-        EXPECT_TRUE(fs::exists(options_.config.booth.avatars() / id / "metadata.json")) << id;
-      }
-    }
-  }
-
-  fs::path config_;
-  pid_t boothd_ = -1;
-};
 
 TEST_F(Process, KilledAtAnyMomentLosesNothingThatWasDone) {
   constexpr int rounds = 12;
@@ -213,6 +141,42 @@ TEST_F(Process, EndsCleanlyOnASignal) {
   EXPECT_THAT(traces(".partial"), IsEmpty());
 }
 
+/// As an upgrade does: the old program is told to stop while jobs wait and one runs, and another takes over.
+TEST_F(Process, AnUpgradeInTheMiddleOfAQueueFinishesEveryJobOnce) {
+  start_boothd();
+  const std::string before = capture({{"face", "none"}});
+  ASSERT_TRUE(wait_job(before, "done"));
+  const auto published = fs::last_write_time(options_.config.booth.avatars() / before / "avatar.dae");
+  reconstruct_.behave("hang");
+  std::vector<std::string> queue;
+  for (int i = 0; i < 3; ++i) {
+    queue.push_back(capture({{"face", "none"}}));
+    ASSERT_TRUE(wait_until(
+        [&] { return call("system.status")["ready"] == true && job(queue.back())["state"] != "not_found"; }));
+  }
+  ASSERT_TRUE(wait_job(queue[0], "running"));
+  EXPECT_EQ(job(queue[2])["state"], "queued");
+  ::kill(boothd_, SIGTERM);
+  const int status = wait_exit();
+  ASSERT_TRUE(WIFEXITED(status) && WEXITSTATUS(status) == 0) << status;
+  const size_t calls = reconstruct_.calls();
+
+  reconstruct_.behave("good");
+  const fs::path newer = folder_.path() / "newer";
+  fs::copy_file(BOOTHD, newer);
+  start_boothd(newer);
+  for (const std::string& id : queue) EXPECT_TRUE(wait_job(id, "done")) << job(id);
+  EXPECT_EQ(reconstruct_.calls(), calls + queue.size()) << "each job ran once more, what was done did not";
+  EXPECT_EQ(fs::last_write_time(options_.config.booth.avatars() / before / "avatar.dae"), published);
+  std::multiset<std::string> avatars;
+  const Json list = call("avatar.list");
+  for (const Json& avatar : list["avatars"]) avatars.insert(avatar["id"]);
+  queue.push_back(before);
+  EXPECT_EQ(avatars, std::multiset<std::string>(queue.begin(), queue.end()));
+  expect_all_whole();
+  EXPECT_TRUE(wait_until([&] { return traces(".partial").empty(); }));
+}
+
 TEST_F(Process, BoothctlOperatesIt) {
   EXPECT_EQ(run({BOOTHCTL, "--control", options_.config.api.control, "--timeout", "0.2", "status"}).first, 3);
   start_boothd();
@@ -276,75 +240,6 @@ TEST_F(Process, KeysOpenTheBoothToOtherMachines) {
   EXPECT_EQ(run({BOOTHCTL, "keys", "revoke", "--folder", keys, "mine"}).first, 1);
   ASSERT_EQ(boothctl({"shutdown"}).first, 0);
   wait_exit();
-}
-
-TEST_F(Process, TheReportHoldsNothingOfTheVisitors) {
-  start_boothd();
-  const std::string label = "Zoë Müller-Lüdenscheidt";
-  const std::string id = capture({{"face", "none"}, {"label", label}});
-  ASSERT_TRUE(wait_job(id, "done"));
-  reconstruct_.behave("fail");
-  const std::string failed = capture({{"face", "none"}, {"label", "Erwin Lindemann"}});
-  ASSERT_TRUE(wait_job(failed, "failed"));
-  // As if something had let a label slip into the log.
-  std::ofstream(folder_.path() / "log", std::ios::app) << "a line about " << label << "\n";
-  const fs::path report = folder_.path() / "report.tar.gz", unpacked = folder_.path() / "unpacked";
-  const auto said = boothctl({"report", "--to", report, "--config", config_, "--log", folder_.path() / "log"});
-  ASSERT_EQ(said.first, 0);
-  fs::create_directories(unpacked);
-  ASSERT_EQ(run({"/bin/tar", "-xzf", report, "-C", unpacked}).first, 0);
-  EXPECT_THAT(entries(unpacked),
-              testing::UnorderedElementsAre("boothd.toml", "describe.json", "doctor.json", "history.json", "log.txt",
-                                            "metrics.json", "status.json", "versions.txt"));
-  for (const std::string& name : entries(unpacked)) {
-    std::ifstream file(unpacked / name);
-    const std::string text((std::istreambuf_iterator<char>(file)), {});
-    EXPECT_THAT(text, testing::Not(IsEmpty())) << name;
-    for (const std::string& private_text : {label, std::string("Lindemann"), id, failed})
-      EXPECT_THAT(text, testing::Not(testing::HasSubstr(private_text))) << name;
-  }
-  std::ifstream log(unpacked / "log.txt");
-  const std::string text((std::istreambuf_iterator<char>(log)), {});
-  EXPECT_THAT(text, testing::HasSubstr("capture-1"));
-
-  EXPECT_THAT(boothctl({"metrics", "--prometheus"}).second,
-              testing::HasSubstr("# TYPE booth_request_seconds histogram"));
-  EXPECT_THAT(boothctl({"history"}).second,
-              testing::AllOf(testing::HasSubstr("started 1 times; captures "), testing::HasSubstr(" threads")));
-  ASSERT_EQ(boothctl({"shutdown"}).first, 0);
-  wait_exit();
-  EXPECT_EQ(run({BOOTHCTL, "--control", options_.config.api.control, "--timeout", "0.2", "report", "--to", report,
-                 "--config", config_, "--log", config_})
-                .first,
-            0)
-      << "also without the booth";
-}
-
-/// What is deleted is gone from all that the booth stores; what it logs never had a name in it.
-TEST_F(Process, NothingIsLeftOfWhoWasDeleted) {
-  constexpr const char* label = "Zo\xc3\xab Quisling";
-  const auto traces = [&](const std::vector<std::string>& words) {
-    std::vector<std::string> command{"traces", "--config", config_};
-    command.insert(command.end(), words.begin(), words.end());
-    return boothctl(command);
-  };
-  start_boothd();
-  std::vector<std::string> ids;
-  for (const char* behaviour : {"good", "fail", "crash"}) {
-    reconstruct_.behave(behaviour);
-    ids.push_back(capture({{"face", "none"}, {"label", label}, {"key", std::string("press-") + behaviour}}));
-    ASSERT_TRUE(wait_until([&] { return job(ids.back())["state"] == (ids.size() == 1 ? "done" : "failed"); }));
-  }
-  EXPECT_EQ(traces({ids[0]}).first, 1);
-  EXPECT_THAT(traces({label}).second, testing::HasSubstr(ids[1]));
-  EXPECT_EQ(call("avatar.delete", {{"avatar", ids[0]}}), Json::object());
-  for (const std::string& id : ids) call("capture.delete", {{"capture", id}});
-  ASSERT_TRUE(wait_until([&] { return entries(options_.config.booth.state_directory / "deleting").empty(); }));
-  const auto [status, output] = traces({ids[0], ids[1], ids[2], label});
-  EXPECT_EQ(status, 0) << output;
-  EXPECT_EQ(traces({label, "--log", folder_.path() / "log"}).first, 0) << "a label is in the log";
-  EXPECT_EQ(traces({ids[0], "--log", folder_.path() / "log"}).first, 1) << "the log is searched";
-  EXPECT_EQ(traces({"press-good"}).first, 1) << "the clients' own words are kept for a day";
 }
 
 TEST_F(Process, RefusesABadConfiguration) {
