@@ -32,19 +32,19 @@ float weight_of(const Trust& trust) {
 struct VertexBands {
   std::vector<Eigen::Array3f> low;  ///< of each vertex: what all cameras make of its surroundings
   std::vector<Eigen::Array3f>
-      correction;  ///< vertex by vertex, one a view: the factor that makes its low band that one
+      correction;  ///< vertex by vertex, one a view: the factor, balance included, that makes its low band that one
 };
 
 /// The mean of the cameras' colours, in which one that is brighter than the others by a highlight counts less.
 Eigen::Array3f consensus(std::span<const Eigen::Array3f> colours, std::span<const float> weights) {
-  // A power mean of the lights: of two equal cameras, one that is twice as bright as the other gets a fifth.
+  // The harmonic mean of the lights: of two equal cameras, one that is twice as bright as the other gets a third.
   constexpr float darkest = 1e-3F;
   Eigen::Array3f sum = Eigen::Array3f::Zero();
   float total = 0;
   for (size_t c = 0; c < colours.size(); ++c) {
     if (!(weights[c] > 0)) continue;
     const float light = std::max(darkest, colours[c].mean());
-    const float weight = weights[c] / (light * light);
+    const float weight = weights[c] / light;
     sum += weight * colours[c];
     total += weight;
   }
@@ -59,7 +59,8 @@ VertexBands make_bands(const Mesh& mesh, std::span<const PreparedView> views, st
   const size_t cameras = views.size(), vertices = mesh.positions.size();
   VertexBands bands;
   bands.low.assign(vertices, Eigen::Array3f::Zero());
-  bands.correction.assign(vertices * cameras, Eigen::Array3f::Ones());
+  bands.correction.resize(vertices * cameras);
+  for (size_t i = 0; i < bands.correction.size(); ++i) bands.correction[i] = views[i % cameras].balance.gain;
   work.parallel_for(vertices, 1024, [&](size_t begin, size_t end) {
     std::vector<Eigen::Array3f> colours(cameras);
     for (size_t v = begin; v < end; ++v) {
@@ -67,12 +68,15 @@ VertexBands make_bands(const Mesh& mesh, std::span<const PreparedView> views, st
       for (size_t c = 0; c < cameras; ++c) {
         if (!(weight[c] > 0)) continue;
         const Eigen::Vector3f& p = views[c].projected[v];
-        colours[c] = sample_level(views[c].colours, std::min(low_level, views[c].colours.size() - 1), p.x(), p.y());
+        const Eigen::Array3f balance = views[c].correction_at(p.x(), p.y());
+        colours[c] =
+            balance * sample_level(views[c].colours, std::min(low_level, views[c].colours.size() - 1), p.x(), p.y());
+        bands.correction[v * cameras + c] = balance;
       }
       bands.low[v] = consensus(colours, weight);
       for (size_t c = 0; c < cameras; ++c)
         if (weight[c] > 0)
-          bands.correction[v * cameras + c] = ((bands.low[v] + black) / (colours[c] + black)).max(least).min(most);
+          bands.correction[v * cameras + c] *= ((bands.low[v] + black) / (colours[c] + black)).max(least).min(most);
     }
   });
   return bands;
@@ -215,11 +219,19 @@ void DetailPainter::look(const TriangleView& triangle, const PreparedView& view,
 /// From weights to shares whose sum is 1.
 BOOTH_VECTOR_CLONES
 void DetailPainter::fade(std::span<Look> looks, const Each& total, size_t count) {
-  // A camera below this share of the weights is not worth looking at; subtracted, so that it fades in. With at most
-  // sixteen cameras one is always above.
+  // A camera below this share is not worth looking at; subtracted, so that it fades in. With at most sixteen cameras
+  // one is always above.
   constexpr float negligible = 0.02F;
-  Each scale, used{};
+  Each scale, flat{}, used{};
   for (size_t i = 0; i < count; ++i) scale[i] = total[i] > 0 ? 1 / total[i] : 0;
+  // The power of 3/4: the others' pictures are nearly as good as the best one, and noise goes down with their number.
+  for (Look& look : looks)
+    for (size_t i = 0; i < count; ++i) {
+      const float share = look.weight[i] * scale[i];
+      look.weight[i] = std::sqrt(share * std::sqrt(share));
+      flat[i] += look.weight[i];
+    }
+  for (size_t i = 0; i < count; ++i) scale[i] = flat[i] > 0 ? 1 / flat[i] : 0;
   for (Look& look : looks)
     for (size_t i = 0; i < count; ++i) {
       look.weight[i] = std::max(0.0F, look.weight[i] * scale[i] - negligible);

@@ -3,6 +3,7 @@
 #include <Eigen/Cholesky>
 #include <Eigen/Geometry>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <numeric>
@@ -17,6 +18,7 @@ struct Pair {
   int one, other;
   float weight;
   Eigen::Array3f difference;  ///< log(one) − log(other)
+  float one_radius2, other_radius2;
 };
 
 /// The area around each vertex, as a multiple of the mean.
@@ -42,11 +44,14 @@ std::vector<Pair> overlaps(const Mesh& mesh, std::span<const PreparedView> views
     int camera;
     float weight;  ///< of a slanted or doubtful look little, but where two cameras share no better one, enough
     Eigen::Array3f light;
+    float radius2;
   };
   std::vector<Pair> pairs;
   std::vector<Sample> samples;
   const std::vector<float> areas = relative_areas(mesh);
-  for (size_t v = 0; v < mesh.positions.size(); ++v) {
+  constexpr size_t enough = 4000;  // vertices, about
+  const size_t step = std::max<size_t>(1, mesh.positions.size() / enough);
+  for (size_t v = 0; v < mesh.positions.size(); v += step) {
     const auto rating = ratings.vertex(v);
     const float best = *std::max_element(rating.begin(), rating.end());
     if (!(best > 0)) continue;
@@ -60,64 +65,109 @@ std::vector<Pair> overlaps(const Mesh& mesh, std::span<const PreparedView> views
       const Eigen::Array3f light =
           sample_level(views[c].colours, std::min(level, views[c].colours.size() - 1), p.x(), p.y());
       if (light.minCoeff() < darkest || light.maxCoeff() > brightest) continue;
-      samples.push_back({static_cast<int>(c), rating[c] / best * trust.visible * trust.confidence, light.log()});
+      samples.push_back({static_cast<int>(c), rating[c] / best * trust.visible * trust.confidence, light.log(),
+                         views[c].squared_radius(p.x(), p.y())});
     }
     for (size_t i = 0; i < samples.size(); ++i)
       for (size_t j = i + 1; j < samples.size(); ++j)
         pairs.push_back({samples[i].camera, samples[j].camera, areas[v] * samples[i].weight * samples[j].weight,
-                         samples[i].light - samples[j].light});
+                         samples[i].light - samples[j].light, samples[i].radius2, samples[j].radius2});
   }
   return pairs;
 }
 
+/// Unknowns of a camera: the logarithms of three gains, and the vignetting.
+constexpr Eigen::Index unknowns = 4, vignetting = 3;
+
+/// The normal equations of all cameras' unknowns.
+struct Equations {
+  Eigen::MatrixXd matrix;
+  Eigen::VectorXd right;
+
+  explicit Equations(Eigen::Index count)
+      : matrix(Eigen::MatrixXd::Zero(count, count)), right(Eigen::VectorXd::Zero(count)) {}
+
+  /// That factors · (the unknowns of that number) shall be `value`.
+  void add(const std::array<Eigen::Index, 4>& number, const Eigen::Vector4d& factors, double value, double weight) {
+    for (Eigen::Index i = 0; i < 4; ++i) {
+      const double weighted = weight * factors[i];
+      for (Eigen::Index k = 0; k < 4; ++k)
+        matrix(number[static_cast<size_t>(i)], number[static_cast<size_t>(k)]) += weighted * factors[k];
+      right[number[static_cast<size_t>(i)]] += weighted * value;
+    }
+  }
+};
+
+/// Of each camera, the weights of its pairs.
+std::vector<double> weight_of_cameras(std::span<const Pair> pairs, size_t cameras) {
+  std::vector<double> weights(cameras, 0);
+  for (const Pair& pair : pairs)
+    for (const int camera : {pair.one, pair.other})
+      weights[static_cast<size_t>(camera)] += static_cast<double>(pair.weight);
+  return weights;
+}
+
+double vignetting_of(const Eigen::VectorXd& correction, size_t view) {
+  return correction[unknowns * static_cast<Eigen::Index>(view) + vignetting];
+}
+/// That with the least vignetting.
+size_t clearest_view(const Eigen::VectorXd& correction) {
+  size_t clearest = 0;
+  for (size_t c = 1; c < static_cast<size_t>(correction.size() / unknowns); ++c)
+    if (vignetting_of(correction, c) < vignetting_of(correction, clearest)) clearest = c;
+  return clearest;
+}
+
 }  // namespace
 
-std::vector<Eigen::Array3f> balance_colours(const Mesh& mesh, std::span<const PreparedView> views,
-                                            const CameraRatings& ratings) {
-  const auto cameras = static_cast<Eigen::Index>(views.size());
+std::vector<LightCorrection> balance_colours(const Mesh& mesh, std::span<const PreparedView> views,
+                                             const CameraRatings& ratings) {
   const std::vector<Pair> pairs = overlaps(mesh, views, ratings);
-  std::vector<Eigen::Array3f> gains(views.size(), Eigen::Array3f::Ones());
+  const std::vector<double> seen = weight_of_cameras(pairs, views.size());
   constexpr int rounds = 8;       // the last two at the scale
   constexpr double scale = 0.08;  // log units: what disagrees by more is another surface or a highlight
   // In observations: keeps cameras without overlap at 1, and is nothing against the few that a narrow overlap has.
   constexpr double prior = 1e-3;
-  for (int channel = 0; channel < 3; ++channel) {
-    Eigen::VectorXd correction = Eigen::VectorXd::Zero(cameras);
-    for (int round = 0; round < rounds; ++round) {
-      Eigen::MatrixXd normal = prior * Eigen::MatrixXd::Identity(cameras, cameras);
-      Eigen::VectorXd right = Eigen::VectorXd::Zero(cameras);
-      for (const Pair& pair : pairs) {
-        const auto difference = static_cast<double>(pair.difference[channel]);
-        const double residual = difference + correction[pair.one] - correction[pair.other];
-        // From plain least squares to the scale step by step: what an outlier is shows only beside good gains.
-        const double tolerated = scale * std::exp2(std::max(0, rounds - 2 - round));
-        const double robust = round == 0 ? 1 : 1 / (1 + residual * residual / (tolerated * tolerated));
-        const double weight = static_cast<double>(pair.weight) * robust;
-        normal(pair.one, pair.one) += weight;
-        normal(pair.other, pair.other) += weight;
-        normal(pair.one, pair.other) -= weight;
-        normal(pair.other, pair.one) -= weight;
-        right[pair.one] -= weight * difference;
-        right[pair.other] += weight * difference;
-      }
-      correction = normal.ldlt().solve(right);
+  // As a share of a camera's observations, each of three channels: what shines differently from different sides looks
+  // like vignetting where squared distances from the middles differ by less than about the root of this.
+  constexpr double vignetting_prior = 3e-4;
+  const auto count = unknowns * static_cast<Eigen::Index>(views.size());
+  Eigen::VectorXd correction = Eigen::VectorXd::Zero(count);
+  std::vector<uint8_t> none(views.size(), 0);  // cameras that are held to have no vignetting
+  for (int round = 0; round < rounds; ++round) {
+    Equations equations(count);
+    equations.matrix.diagonal().setConstant(prior);
+    for (size_t c = 0; c < views.size(); ++c) {
+      const auto at = unknowns * static_cast<Eigen::Index>(c) + vignetting;
+      equations.matrix(at, at) += 3 * (none[c] != 0 ? 1 : vignetting_prior) * seen[c];
     }
-    for (Eigen::Index c = 0; c < cameras; ++c)
-      gains[static_cast<size_t>(c)][channel] = static_cast<float>(std::exp(correction[c]));
+    // From plain least squares to the scale step by step: what an outlier is shows only beside good gains.
+    const double tolerated = scale * std::exp2(std::max(0, rounds - 2 - round));
+    for (const Pair& pair : pairs) {
+      const Eigen::Index one = unknowns * pair.one, other = unknowns * pair.other;
+      const Eigen::Vector4d factors(1, -1, static_cast<double>(pair.one_radius2),
+                                    -static_cast<double>(pair.other_radius2));
+      for (Eigen::Index channel = 0; channel < 3; ++channel) {
+        const std::array<Eigen::Index, 4> number{one + channel, other + channel, one + vignetting, other + vignetting};
+        const auto difference = static_cast<double>(pair.difference[channel]);
+        double residual = difference;
+        for (Eigen::Index i = 0; i < 4; ++i) residual += factors[i] * correction[number[static_cast<size_t>(i)]];
+        const double robust = round == 0 ? 1 : 1 / (1 + residual * residual / (tolerated * tolerated));
+        equations.add(number, factors, -difference, static_cast<double>(pair.weight) * robust);
+      }
+    }
+    correction = equations.matrix.ldlt().solve(equations.right);
+    // No lens brightens a corner: what the overlaps leave open is such that the clearest one does not darken it.
+    if (const auto clearest = clearest_view(correction); round + 2 < rounds && vignetting_of(correction, clearest) < 0)
+      none[clearest] = 1;
   }
-  return gains;
-}
-
-void apply_gains(std::span<PreparedView> views, std::span<const Eigen::Array3f> gains, const Work& work) {
-  work.parallel_for(views.size(), 1, [&](size_t begin, size_t end) {
-    for (size_t c = begin; c < end; ++c)
-      for (LightImage& level : views[c].colours)
-        for (size_t i = 0; i < level.samples.size(); i += 4)
-          for (size_t k = 0; k < 3; ++k) {
-            const float light = gains[c][static_cast<Eigen::Index>(k)] * static_cast<float>(level.samples[i + k]);
-            level.samples[i + k] = static_cast<int16_t>(std::min(light + 0.5F, brightest_light));
-          }
-  });
+  std::vector<LightCorrection> corrections(views.size());
+  for (size_t c = 0; c < views.size(); ++c) {
+    const auto at = unknowns * static_cast<Eigen::Index>(c);
+    corrections[c].gain = correction.segment<3>(at).array().exp().cast<float>();
+    corrections[c].vignetting = static_cast<float>(std::max(0.0, vignetting_of(correction, c)));
+  }
+  return corrections;
 }
 
 }  // namespace booth

@@ -1,23 +1,28 @@
 #pragma once
 
-#include <algorithm>
-#include <cmath>
+#include <Eigen/Core>
+#include <array>
+#include <cstddef>
+#include <span>
+#include <vector>
 
 #include "pipeline/atlas/input_preparation.h"
+#include "pipeline/types/work.h"
 
 namespace booth {
 
-/// Grey values about as the eye sees them, 0 … 255, so that noise is alike in light and shade.
-inline FloatImage grey_image(const LightImage& light) {
-  FloatImage grey(light.width, light.height, 1);
-  for (size_t i = 0; i < grey.samples.size(); ++i) {
-    const int16_t* p = light.samples.data() + 4 * i;
-    const float luma =
-        0.25F * static_cast<float>(p[0]) + 0.5F * static_cast<float>(p[1]) + 0.25F * static_cast<float>(p[2]);
-    grey.samples[i] = 255 * std::sqrt(luma / full_light);
-  }
-  return grey;
-}
+/// A view's levels 1, 2 and 3 in grey values about as the eye sees them, 0 … 255, so that noise is alike in light and
+/// shade; the cameras' differences corrected.
+struct GreyLevels {
+  static constexpr size_t finest = 1, count = 3;
+  std::array<FloatImage, count> images;
+
+  /// Of 1 … 3.
+  const FloatImage& level(size_t k) const { return images[k - finest]; }
+};
+
+/// One a view. A pyramid that ends early goes on with its last level.
+std::vector<GreyLevels> grey_levels(std::span<const PreparedView> views, const Work& work = {});
 
 /// Where a pixel of level 0 lies in a level of the pyramid.
 inline Eigen::Vector2f on_level(const Eigen::Vector2f& pixel, float scale) {

@@ -311,6 +311,15 @@ PreparedView prepare_view(const Mesh& mesh, const RigCamera& camera, const Frame
   return view;
 }
 
+float PreparedView::squared_radius(float x, float y) const {
+  const Intrinsics& k = camera->intrinsics;
+  const auto cx = static_cast<float>(k.cx), cy = static_cast<float>(k.cy);
+  const float widest = std::max(cx, static_cast<float>(k.width - 1) - cx);
+  const float highest = std::max(cy, static_cast<float>(k.height - 1) - cy);
+  const float across = x + static_cast<float>(left) - cx, down = y + static_cast<float>(top) - cy;
+  return (across * across + down * down) / (widest * widest + highest * highest);
+}
+
 void project_again(const Mesh& mesh, PreparedView* view) {
   view->projected = project_vertices(mesh, *view->camera, view->left, view->top);
 }

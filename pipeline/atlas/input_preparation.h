@@ -1,6 +1,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <cmath>
 #include <cstdint>
 #include <vector>
 
@@ -29,6 +30,15 @@ struct TrustCell {
   uint32_t confidence = 0;
 };
 
+/// What makes a camera's light comparable with the other cameras': factors of linear light.
+struct LightCorrection {
+  Eigen::Array3f gain = Eigen::Array3f::Ones();  ///< by channel
+  /// The logarithm of the factor by which the image's corner is darker than its principal point, for a lens that
+  /// darkens with the square of the distance from there; the factor for that square r², 1 at the corner, is
+  /// exp(vignetting r²).
+  float vignetting = 0;
+};
+
 /// What texturing needs of one camera, cropped to the subject. Pixel coordinates are relative to the crop.
 struct PreparedView {
   const RigCamera* camera = nullptr;
@@ -40,6 +50,15 @@ struct PreparedView {
   Raster<TrustCell> trust;  ///< at half the resolution (level 1 of the pyramid)
   Raster<uint16_t> margin;  ///< like `trust`: how far the silhouette's outline is, thirds of a pixel of this map
   int left = 0, top = 0;    ///< of the crop in the image
+  LightCorrection balance;  ///< not applied to `colours`
+
+  /// The squared distance of a pixel from the principal point; that of the image's farthest corner is 1.
+  float squared_radius(float x, float y) const;
+  /// `balance` at a pixel.
+  Eigen::Array3f correction_at(float x, float y) const {
+    return balance.vignetting == 0 ? balance.gain
+                                   : Eigen::Array3f(balance.gain * std::exp(balance.vignetting * squared_radius(x, y)));
+  }
 };
 
 /// @param frame  grey or RGB, the size of the camera's image; so is the silhouette

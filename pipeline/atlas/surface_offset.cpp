@@ -49,14 +49,8 @@ struct PatchView {
 class Correlator {
  public:
   Correlator(const Mesh& mesh, std::span<const PreparedView> views, const CameraRatings& ratings,
-             std::span<const float> weights, float pitch_m)
-      : mesh_(mesh), views_(views), ratings_(ratings), weights_(weights), pitch_m_(pitch_m) {
-    for (const PreparedView& view : views) {
-      auto& levels = greys_.emplace_back();
-      for (size_t k = 0; k < levels.size(); ++k)
-        levels[k] = grey_image(view.colours[std::min(k + finest_level, view.colours.size() - 1)]);
-    }
-  }
+             std::span<const float> weights, std::span<const GreyLevels> greys, float pitch_m)
+      : mesh_(mesh), views_(views), ratings_(ratings), weights_(weights), greys_(greys), pitch_m_(pitch_m) {}
 
   /// The damped correlation between the cameras that see the vertex best, at each offset; 0 where nothing can be said.
   Scores operator()(size_t v, const Eigen::Vector3f& normal) const {
@@ -83,8 +77,6 @@ class Correlator {
   }
 
  private:
-  static constexpr size_t finest_level = 1;
-
   std::pair<std::array<PatchView, most_cameras>, size_t> best_views(size_t v, const Eigen::Vector3f& normal) const {
     constexpr float good_share = 0.2F;  // of the best camera's weight
     const auto weight = weights_.subspan(v * views_.size(), views_.size());
@@ -111,11 +103,11 @@ class Correlator {
     const PreparedView& view = views_[c];
     const float pixels_a_pitch = pitch_m_ * std::sqrt(ratings_.vertex(v)[c]);
     const auto level = static_cast<size_t>(std::clamp(std::lround(std::log2(std::max(1.0F, pixels_a_pitch))),
-                                                      static_cast<long>(finest_level),
-                                                      static_cast<long>(finest_level + greys_[c].size() - 1)));
+                                                      static_cast<long>(GreyLevels::finest),
+                                                      static_cast<long>(GreyLevels::finest + GreyLevels::count - 1)));
     const float scale = 1 / static_cast<float>(1 << level);
     PatchView patch;
-    patch.grey = &greys_[c][level - finest_level];
+    patch.grey = &greys_[c].level(level);
     if (patch.grey->width < 2 || patch.grey->height < 2) return {};
     patch.origin = on_level(view.projected[v].head<2>(), scale);
     std::array<Eigen::Vector2f, 3> steps_px;
@@ -150,8 +142,8 @@ class Correlator {
   std::span<const PreparedView> views_;
   const CameraRatings& ratings_;
   std::span<const float> weights_;
+  std::span<const GreyLevels> greys_;
   float pitch_m_;
-  std::vector<std::array<FloatImage, 3>> greys_;
 };
 
 /// The place of a parabola's top through three values one apart, −0.5 … 0.5.
@@ -196,11 +188,12 @@ std::vector<float> offset_limits(const Mesh& mesh, std::span<const PreparedView>
 }
 
 std::vector<float> find_surface_offsets(const Mesh& mesh, std::span<const PreparedView> views,
-                                        const CameraRatings& ratings, std::span<const float> weights,
-                                        std::span<const float> limits, const Work& work) {
+                                        std::span<const GreyLevels> greys, const CameraRatings& ratings,
+                                        std::span<const float> weights, std::span<const float> limits,
+                                        const Work& work) {
   const float pitch_m = 2 / std::sqrt(usual_rating(ratings));  // two pixels of the usual camera
   const std::vector<Eigen::Vector3f> normals = vertex_normals(mesh);
-  const Correlator correlate(mesh, views, ratings, weights, pitch_m);
+  const Correlator correlate(mesh, views, ratings, weights, greys, pitch_m);
   std::vector<Scores> scores(mesh.positions.size(), Scores::Zero());
   work.parallel_for(scores.size(), 512, [&](size_t begin, size_t end) {
     for (size_t v = begin; v < end; ++v) scores[v] = correlate(v, normals[v]);

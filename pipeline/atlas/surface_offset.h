@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "pipeline/atlas/camera_ratings.h"
+#include "pipeline/atlas/grey_image.h"
 #include "pipeline/atlas/input_preparation.h"
 #include "pipeline/types/mesh.h"
 #include "pipeline/types/work.h"
@@ -25,6 +26,7 @@ std::vector<float> offset_limits(const Mesh& mesh, std::span<const PreparedView>
 /// lies near its neighbours' (iterated conditional modes). Outwards the limits hold. Inwards they have a price, for an
 /// outline may be another vertex's.
 ///
+/// @param greys    of grey_levels()
 /// @param weights  vertex by vertex, one a view: how much its picture of the vertex is worth, 0 = nothing
 /// @param limits   of offset_limits(); 0 for a vertex that is known to be right and stays
 /// Cost: vertices × up to 4 cameras × 13 offsets × 49 samples.
@@ -32,7 +34,8 @@ std::vector<float> offset_limits(const Mesh& mesh, std::span<const PreparedView>
 /// graph-cuts and occlusion robust photo-consistency", IEEE PAMI 29(12), 2007; the minimisation, J. Besag, "On the
 /// statistical analysis of dirty pictures", J. R. Stat. Soc. B 48(3), 1986.
 std::vector<float> find_surface_offsets(const Mesh& mesh, std::span<const PreparedView> views,
-                                        const CameraRatings& ratings, std::span<const float> weights,
-                                        std::span<const float> limits, const Work& work = {});
+                                        std::span<const GreyLevels> greys, const CameraRatings& ratings,
+                                        std::span<const float> weights, std::span<const float> limits,
+                                        const Work& work = {});
 
 }  // namespace booth

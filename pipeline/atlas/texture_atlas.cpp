@@ -10,6 +10,7 @@
 #include "pipeline/atlas/blending.h"
 #include "pipeline/atlas/camera_ratings.h"
 #include "pipeline/atlas/colour_balance.h"
+#include "pipeline/atlas/grey_image.h"
 #include "pipeline/atlas/occluder.h"
 #include "pipeline/atlas/packing.h"
 #include "pipeline/atlas/push_pull.h"
@@ -115,23 +116,32 @@ std::vector<std::array<Eigen::Vector2f, 3>> texture_coordinates(const Packing& p
 
 /// What the product's method does before anything is painted: balances the colours and lays the surface where the
 /// cameras agree on it.
-void prepare_fully(Mesh* mesh, std::span<PreparedView> views, const CameraRatings& ratings,
-                   std::span<const uint8_t> exact, const AtlasOptions& options, const Work& work) {
-  if (options.balance_colours) apply_gains(views, balance_colours(*mesh, views, ratings), work);
-  if (!options.align_surface) return;
+///
+/// @return the views' grey levels
+std::vector<GreyLevels> prepare_fully(Mesh* mesh, std::span<PreparedView> views, const CameraRatings& ratings,
+                                      std::span<const uint8_t> exact, const AtlasOptions& options, const Work& work) {
+  if (options.balance_colours) {
+    const std::vector<LightCorrection> corrections = balance_colours(*mesh, views, ratings);
+    for (size_t c = 0; c < views.size(); ++c) views[c].balance = corrections[c];
+  }
+  std::vector<GreyLevels> greys = grey_levels(views, work);
+  if (!options.align_surface) return greys;
   std::vector<float> limits = offset_limits(*mesh, views);
   for (size_t v = 0; v < exact.size(); ++v)
     if (exact[v] != 0) limits[v] = 0;
   const std::vector<float> weights = weigh_views(*mesh, views, ratings);
-  const std::vector<float> offsets = find_surface_offsets(*mesh, views, ratings, weights, limits, work);
+  const std::vector<float> offsets = find_surface_offsets(*mesh, views, greys, ratings, weights, limits, work);
   const std::vector<Eigen::Vector3f> normals = vertex_normals(*mesh);
   for (size_t v = 0; v < offsets.size(); ++v) mesh->positions[v] += offsets[v] * normals[v];
-  for (PreparedView& view : views) project_again(*mesh, &view);
+  work.parallel_for(views.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t c = begin; c < end; ++c) project_again(*mesh, &views[c]);
+  });
+  return greys;
 }
 
 TexelColours paint(const Mesh& mesh, const Packing& packing, std::span<const PreparedView> views,
-                   const CameraRatings& ratings, const Occluder& occluder, const AtlasOptions& options,
-                   const Work& work) {
+                   std::span<const GreyLevels> greys, const CameraRatings& ratings, const Occluder& occluder,
+                   const AtlasOptions& options, const Work& work) {
   switch (options.method) {
     case TextureMethod::best_view: return paint_best_views(mesh, packing, options.size, views, ratings, work);
     case TextureMethod::blend: return paint_rating_means(mesh, packing, options.size, views, ratings, occluder, work);
@@ -139,7 +149,7 @@ TexelColours paint(const Mesh& mesh, const Packing& packing, std::span<const Pre
   }
   const std::vector<float> weights = weigh_views(mesh, views, ratings);
   std::vector<Eigen::Vector2f> shifts;
-  if (options.align_views) shifts = align_views(mesh, views, ratings, weights, work);
+  if (options.align_views) shifts = align_views(mesh, views, greys, ratings, weights, work);
   return blend_texels(mesh, packing, options.size, views, ratings, weights, shifts, work);
 }
 
@@ -200,7 +210,8 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& untextured, const Rig& rig,
   work.report(0.4);
 
   step.emplace(work, "atlas: agreement");
-  if (options.method == TextureMethod::full) prepare_fully(&mesh, views, ratings, exact, options, work);
+  std::vector<GreyLevels> greys;
+  if (options.method == TextureMethod::full) greys = prepare_fully(&mesh, views, ratings, exact, options, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.5);
 
@@ -213,7 +224,7 @@ Result<TextureAtlas> build_texture_atlas(const Mesh& untextured, const Rig& rig,
   work.report(0.6);
 
   step.emplace(work, "atlas: texels");
-  TexelColours texels = paint(mesh, packing, views, ratings, occluder, options, work);
+  TexelColours texels = paint(mesh, packing, views, greys, ratings, occluder, options, work);
   if (work.stopped()) return Work::cancelled();
   work.report(0.95);
 

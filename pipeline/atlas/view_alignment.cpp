@@ -95,14 +95,9 @@ struct Equations {
 
 class Aligner {
  public:
-  Aligner(const Mesh& mesh, std::span<const PreparedView> views, const CameraRatings& ratings,
-          std::span<const float> weights, const Work& work)
-      : views_(views), grids_(mesh.positions.size()), greys_(views.size()), shifts_(weights.size()) {
-    std::fill(shifts_.begin(), shifts_.end(), Eigen::Vector2f::Zero());
-    work.parallel_for(views.size(), 1, [&](size_t begin, size_t end) {
-      for (size_t c = begin; c < end; ++c)
-        greys_[c] = grey_image(views[c].colours[std::min(level, views[c].colours.size() - 1)]);
-    });
+  Aligner(const Mesh& mesh, std::span<const PreparedView> views, std::span<const GreyLevels> greys,
+          const CameraRatings& ratings, std::span<const float> weights, const Work& work)
+      : views_(views), grids_(mesh.positions.size()), greys_(greys), shifts_(weights.size(), Eigen::Vector2f::Zero()) {
     const float pitch_m = 2 / std::sqrt(usual_rating(ratings));  // two pixels of the usual camera
     const std::vector<Eigen::Vector3f> normals = vertex_normals(mesh);
     work.parallel_for(grids_.size(), grain, [&](size_t begin, size_t end) {
@@ -161,6 +156,8 @@ class Aligner {
  private:
   static constexpr size_t grain = 512;
 
+  const FloatImage& grey(size_t view) const { return greys_[view].level(level); }
+
   std::vector<Equations> equations_everywhere(const Work& work) const {
     std::vector<Equations> equations(shifts_.size());
     work.parallel_for(grids_.size(), grain, [&](size_t begin, size_t end) {
@@ -184,7 +181,7 @@ class Aligner {
     if (!(best > 0)) return grids;
     std::vector<size_t> order;
     for (size_t c = 0; c < weights.size(); ++c)
-      if (weights[c] > least_share * best && greys_[c].width > 1 && greys_[c].height > 1) order.push_back(c);
+      if (weights[c] > least_share * best && grey(c).width > 1 && grey(c).height > 1) order.push_back(c);
     std::stable_sort(order.begin(), order.end(), [&](size_t l, size_t r) { return weights[l] > weights[r]; });
     order.resize(std::min(order.size(), most_cameras));
     const Eigen::Vector3f across = normal.unitOrthogonal(), along = normal.cross(across);
@@ -209,7 +206,7 @@ class Aligner {
     Patch mean = Patch::Zero();
     float total = 0;
     for (size_t i = 0; i < grids.size(); ++i) {
-      drawn[i] = draw(greys_[grids[i].view], grids[i], shifts_[v * views_.size() + grids[i].view]);
+      drawn[i] = draw(grey(grids[i].view), grids[i], shifts_[v * views_.size() + grids[i].view]);
       mean += grids[i].weight * drawn[i].value;
       total += grids[i].weight;
     }
@@ -244,7 +241,7 @@ class Aligner {
 
   std::span<const PreparedView> views_;
   std::vector<std::vector<PatchGrid>> grids_;  ///< of each vertex
-  std::vector<FloatImage> greys_;
+  std::span<const GreyLevels> greys_;
   std::vector<Eigen::Vector2f> shifts_;  ///< pixels of the level
   std::vector<float> at_rest_;           ///< disagreement before any motion
 };
@@ -252,11 +249,11 @@ class Aligner {
 }  // namespace
 
 std::vector<Eigen::Vector2f> align_views(const Mesh& mesh, std::span<const PreparedView> views,
-                                         const CameraRatings& ratings, std::span<const float> weights,
-                                         const Work& work) {
+                                         std::span<const GreyLevels> greys, const CameraRatings& ratings,
+                                         std::span<const float> weights, const Work& work) {
   constexpr int steps = 3;
   const VertexNeighbours neighbours = neighbours_of(mesh);
-  Aligner aligner(mesh, views, ratings, weights, work);
+  Aligner aligner(mesh, views, greys, ratings, weights, work);
   for (int step = 0; step < steps; ++step) aligner.step(neighbours, work);
   aligner.keep_what_helps(neighbours, work);
   return std::move(aligner).shifts();

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "pipeline/atlas/camera_ratings.h"
+#include "pipeline/atlas/grey_image.h"
 #include "pipeline/atlas/input_preparation.h"
 #include "pipeline/types/mesh.h"
 #include "pipeline/types/work.h"
@@ -23,7 +24,7 @@ namespace booth {
 /// Source: B. D. Lucas, T. Kanade, "An iterative image registration technique with an application to stereo vision",
 /// IJCAI 1981; the application to textures, M. Eisemann et al., "Floating textures", Eurographics 2008.
 std::vector<Eigen::Vector2f> align_views(const Mesh& mesh, std::span<const PreparedView> views,
-                                         const CameraRatings& ratings, std::span<const float> weights,
-                                         const Work& work = {});
+                                         std::span<const GreyLevels> greys, const CameraRatings& ratings,
+                                         std::span<const float> weights, const Work& work = {});
 
 }  // namespace booth

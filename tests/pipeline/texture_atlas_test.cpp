@@ -14,7 +14,11 @@
 #include <utility>
 #include <vector>
 
+#include "pipeline/atlas/camera_ratings.h"
+#include "pipeline/atlas/colour_balance.h"
+#include "pipeline/atlas/input_preparation.h"
 #include "pipeline/atlas/linear_light.h"
+#include "pipeline/atlas/occluder.h"
 #include "pipeline/geometry/camera_model.h"
 #include "pipeline/surface/marching_cubes.h"
 #include "pipeline/thread_pool.h"
@@ -323,6 +327,45 @@ TEST_F(TextureAtlasOfAPerson, IsUniformWhereTheyAreWhateverTheGains) {
     most = most.max(s.colour.array());
   }
   EXPECT_LE((most - least).maxCoeff(), 1.0) << least.transpose() << " … " << most.transpose();
+}
+
+/// What balance_colours() finds where each camera's picture is darkened as its factor of `gains` and `vignetting` says.
+std::vector<LightCorrection> balance_of_darkened(const Scene& scene, std::span<const double> gains,
+                                                 std::span<const double> vignetting) {
+  const Occluder occluder(scene.mesh);
+  std::vector<PreparedView> views;
+  for (size_t c = 0; c < scene.frames.size(); ++c) {
+    auto image = std::make_shared<Image>(*scene.frames[c].pixels);
+    const Intrinsics& k = scene.rig.cameras[c].intrinsics;
+    const double corner2 =
+        std::pow(std::max(k.cx, k.width - 1 - k.cx), 2) + std::pow(std::max(k.cy, k.height - 1 - k.cy), 2);
+    for (int y = 0; y < image->height; ++y)
+      for (int x = 0; x < image->width; ++x) {
+        const double radius2 = (std::pow(x - k.cx, 2) + std::pow(y - k.cy, 2)) / corner2;
+        const double factor = gains[c] * std::exp(-vignetting[c] * radius2);
+        for (int i = 0; i < 3; ++i) {
+          uint8_t& sample = image->at(x, y, i);
+          sample = srgb_from_linear(static_cast<float>(factor) * linear_from_srgb(sample));
+        }
+      }
+    Frame frame = scene.frames[c];
+    frame.pixels = std::move(image);
+    views.push_back(
+        prepare_view(scene.mesh, scene.rig.cameras[c], frame, scene.silhouettes[c], 0.012, Inpainting::push_pull));
+  }
+  return balance_colours(scene.mesh, views, rate_cameras(scene.mesh, occluder, views));
+}
+
+TEST_F(TextureAtlasOfAPerson, FindsVignettingWhereTheOverlapsTellAndNoneWhereThereIsNone) {
+  const std::array<double, 6> level{1, 1, 1, 1, 1, 1}, none{}, gains{1, 0.8, 1.1, 0.9, 1, 0.85};
+  const std::array<double, 6> vignetting{0.5, 0, 0.3, 0.1, 0.6, 0};
+  for (const LightCorrection& correction : balance_of_darkened(*scene_, level, none)) {
+    EXPECT_NEAR(correction.vignetting, 0, 0.05);
+    EXPECT_NEAR(correction.gain.mean(), 1, 0.02);
+  }
+  const auto corrections = balance_of_darkened(*scene_, gains, vignetting);
+  for (size_t c = 0; c < corrections.size(); ++c)
+    EXPECT_NEAR(corrections[c].vignetting, vignetting[c], 0.12) << "camera " << c;
 }
 
 TEST_F(TextureAtlasOfAPerson, DoesNotLetAFinelyMeshedGlossyHeadDecideTheBodysColours) {
