@@ -15,7 +15,6 @@
 #include <cmath>
 #include <cstdlib>
 #include <ctime>
-#include <iostream>
 #include <limits>
 #include <string>
 #include <utility>
@@ -31,16 +30,10 @@
 #include "pipeline/surface/smoothing.h"
 #include "pipeline/thread_pool.h"
 #include "replay/recording.h"
+#include "tests/benchmarks/benchmarking.h"
 
 namespace booth {
 namespace {
-
-template <class T>
-T must(Result<T> result) {
-  if (result) return std::move(*result);
-  std::cerr << result.error().message << "\n";
-  std::exit(1);
-}
 
 struct Inputs {
   ThreadPool pool;

@@ -13,28 +13,20 @@
 #include <filesystem>
 #include <fstream>
 #include <functional>
-#include <iostream>
 #include <opencv2/imgproc.hpp>
 #include <opencv2/video/background_segm.hpp>
 #include <optional>
-#include <string>
 #include <vector>
 
 #include "pipeline/image/codec.h"
 #include "pipeline/segmentation/segmentation.h"
 #include "replay/recording.h"
+#include "tests/benchmarks/benchmarking.h"
 
 namespace booth {
 namespace {
 
 namespace fs = std::filesystem;
-
-template <class T>
-T must(Result<T> result) {
-  if (result) return std::move(*result);
-  std::cerr << result.error().message << "\n";
-  std::exit(1);
-}
 
 struct CameraFrames {
   std::vector<Frame> background;

@@ -5,9 +5,6 @@
 
 #include <cstdlib>
 #include <filesystem>
-#include <fstream>
-#include <iostream>
-#include <string>
 
 #include "daemon/reconstruct_job.h"
 #include "pipeline/atlas/texture_atlas.h"
@@ -22,28 +19,10 @@
 #include "pipeline/surface/smoothing.h"
 #include "pipeline/thread_pool.h"
 #include "replay/recording.h"
+#include "tests/benchmarks/benchmarking.h"
 
 namespace booth {
 namespace {
-
-/// The peak of the resident memory since the last reset, from the kernel.
-class PeakMemory {
- public:
-  static void reset() { std::ofstream("/proc/self/clear_refs") << "5"; }
-  static double mebibytes() {
-    std::ifstream status("/proc/self/status");
-    for (std::string word; status >> word;)
-      if (double kibibytes = 0; word == "VmHWM:" && status >> kibibytes) return kibibytes / 1024;
-    return 0;
-  }
-};
-
-template <class T>
-T must(Result<T> result) {
-  if (result) return std::move(*result);
-  std::cerr << result.error().message << "\n";
-  std::exit(1);
-}
 
 /// What every stage starts from, made once by the stages before it.
 struct Inputs {

@@ -5,13 +5,9 @@
 #include <benchmark/benchmark.h>
 
 #include <algorithm>
-#include <cstdlib>
-#include <fstream>
-#include <iostream>
 #include <memory>
 #include <opencv2/imgproc.hpp>
 #include <random>
-#include <string>
 #include <utility>
 #include <vector>
 
@@ -24,30 +20,12 @@
 #include "pipeline/surface/marching_cubes.h"
 #include "pipeline/surface/smoothing.h"
 #include "pipeline/thread_pool.h"
+#include "tests/benchmarks/benchmarking.h"
 #include "tests/synthetic/body.h"
 #include "tests/synthetic/scene.h"
 
 namespace booth {
 namespace {
-
-/// The peak of the resident memory since the last reset, from the kernel.
-class PeakMemory {
- public:
-  static void reset() { std::ofstream("/proc/self/clear_refs") << "5"; }
-  static double mebibytes() {
-    std::ifstream status("/proc/self/status");
-    for (std::string word; status >> word;)
-      if (double kibibytes = 0; word == "VmHWM:" && status >> kibibytes) return kibibytes / 1024;
-    return 0;
-  }
-};
-
-template <class T>
-T must(Result<T> result) {
-  if (result) return std::move(*result);
-  std::cerr << result.error().message << "\n";
-  std::exit(1);
-}
 
 /// Enlarged, with the noise of a sensor if asked for.
 Image enlarged(const Image& small, int width, int height, bool noisy, uint32_t seed) {
