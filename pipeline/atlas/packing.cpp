@@ -29,14 +29,20 @@ struct Run {
   int length() const { return end - begin; }
 };
 struct Footprint {
-  int width = 0, height = 0;  ///< blocks
-  std::vector<Run> runs;      ///< of spread_out()
+  int width = 0, height = 0;     ///< blocks
+  std::vector<Run> runs;         ///< of spread_out()
+  std::vector<int> longest_run;  ///< of each row
 };
 
-/// Puts first the longest run, then such as lie far from all before: neighbouring rows fail at the same places, so a
-/// place where the piece does not fit is soon found out.
+/// Measures the rows and puts first the longest run, then such as lie far from all before: neighbouring rows fail at
+/// the same places, so a place where the piece does not fit is soon found out.
 void spread_out(Footprint* footprint) {
   std::vector<Run>& runs = footprint->runs;
+  footprint->longest_run.assign(static_cast<size_t>(footprint->height), 0);
+  for (const Run& run : runs) {
+    int& longest = footprint->longest_run[static_cast<size_t>(run.row)];
+    longest = std::max(longest, run.length());
+  }
   if (runs.empty()) return;
   const auto order = [](const Run& run) {  // rows by their reversed bits: 0, 1/2, 1/4, 3/4, 1/8 …
     uint32_t row = static_cast<uint32_t>(run.row), reversed = 0;
@@ -189,6 +195,7 @@ Footprint half_turned(const Footprint& footprint) {
   Footprint turned = footprint;
   for (Run& run : turned.runs)
     run = {footprint.height - 1 - run.row, footprint.width - run.end, footprint.width - run.begin};
+  std::reverse(turned.longest_run.begin(), turned.longest_run.end());
   return turned;
 }
 
@@ -251,10 +258,12 @@ class Bin {
 
   /// Whether every row has room for the longest run there: the cheapest test, and one that most places fail.
   bool fits_lengthwise(const Footprint& footprint, int y) const {
-    for (const Run& run : footprint.runs)
-      if (longest_free_[static_cast<size_t>(y + run.row)] < run.length()) return false;
-    return true;
+    if (footprint.runs.empty()) return true;
+    const Run& longest = footprint.runs.front();
+    const int* free = longest_free_.data() + y;
+    return free[longest.row] >= longest.length() && none_longer(footprint.longest_run, free);
   }
+  static bool none_longer(std::span<const int> lengths, const int* free);
 
   /// Removes the places where the run would meet what is taken; false when none is left.
   bool close(std::vector<uint64_t>& open, const Run& run, int y) const {
@@ -298,6 +307,15 @@ class Bin {
   std::vector<uint64_t> bits_;
   std::vector<int> longest_free_;  ///< by row
 };
+
+BOOTH_VECTOR_CLONES
+bool Bin::none_longer(std::span<const int> lengths, const int* free) {
+  const int* length = lengths.data();
+  const size_t count = lengths.size();
+  int longer = 0;
+  for (size_t i = 0; i < count; ++i) longer |= length[i] > free[i] ? 1 : 0;
+  return longer == 0;
+}
 
 /// Clears the bits of `open` that are set in one of two rows, which are moved; returns all that is left.
 BOOTH_VECTOR_CLONES
