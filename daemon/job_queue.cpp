@@ -44,6 +44,14 @@ std::string write_job(const Job& job) {
   return json.dump(2, ' ', false, Json::error_handler_t::replace) + "\n";
 }
 
+/// 0 where it is not there, or is no count.
+int read_count(const Json& json, const char* name) {
+  constexpr uint64_t most = 1000;  // beyond any that is acted on
+  const auto found = json.find(name);
+  if (found == json.end() || !found->is_number_unsigned()) return 0;
+  return static_cast<int>(std::min(found->get<uint64_t>(), most));
+}
+
 /// Nothing for what is not a job of that id. Only what every version has is asked for.
 std::optional<Job> parse_job(const std::vector<uint8_t>& bytes, const std::string& id) {
   try {
@@ -52,8 +60,8 @@ std::optional<Job> parse_job(const std::vector<uint8_t>& bytes, const std::strin
     job.id = json.at("id").get<std::string>();
     job.face = json.value("face", "auto");
     job.label = json.value("label", "");
-    job.interrupted = json.value("interrupted", 0);
-    job.died = json.value("died", 0);
+    job.interrupted = read_count(json, "interrupted");
+    job.died = read_count(json, "died");
     job.recorded = json.value("recorded", true);
     if (const auto error = json.find("error"); error != json.end() && error->is_object())
       job.error = Reason{error->value("kind", "internal"), error->value("message", "it is not known why")};

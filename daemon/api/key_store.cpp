@@ -23,6 +23,7 @@ constexpr std::chrono::hours lifetime{24};
 constexpr size_t most_keys = 100'000;      ///< the oldest go first, should somebody use up more in a day
 constexpr size_t most_ended_lines = 1000;  ///< in the journal, besides as many as have not ended
 constexpr size_t most_journal_bytes = 256UL * 1024 * 1024;
+constexpr uint64_t latest_s = 9'000'000'000;  ///< that a time point, which counts nanoseconds, can hold
 
 std::string digest_of(const std::string& key, const std::string& method, const Json& params) {
   const std::string text = Json{key, method, params}.dump();
@@ -54,7 +55,9 @@ Result<std::unique_ptr<KeyStore>> KeyStore::open(const std::filesystem::path& jo
     for (std::string line; std::getline(lines, line);) {
       const Json json = Json::parse(line, nullptr, false);
       try {
-        const Clock::time_point until{std::chrono::seconds(json.at("until").get<int64_t>())};
+        const Json& seconds = json.at("until");
+        if (!seconds.is_number_unsigned() || seconds.get<uint64_t>() > latest_s) continue;
+        const Clock::time_point until{std::chrono::seconds(seconds.get<int64_t>())};
         // A clock that was set back must not make a key live for years.
         if (until <= now || until > now + lifetime) continue;
         const auto key = json.at("key").get<std::string>();

@@ -171,8 +171,8 @@ Result<void> VideoControls::apply_named(const std::map<std::string, int64_t>& va
   };
   std::vector<Named> pending;
   for (const auto& [name, value] : values) {
-    const auto found =
-        std::find_if(controls_.begin(), controls_.end(), [&](const auto& entry) { return entry.second.name == name; });
+    const auto found = std::find_if(controls_.begin(), controls_.end(),
+                                    [&wanted = name](const auto& entry) { return entry.second.name == wanted; });
     if (found == controls_.end()) {
       std::string known;
       for (const auto& [id, control] : controls_) known += (known.empty() ? "" : ", ") + control.name;

@@ -300,6 +300,22 @@ TEST(JobQueue, AJobThatDiedWaitsForTheOthers) {
   EXPECT_FALSE(take());
 }
 
+TEST(JobQueue, CountsThatAreNoneAreNotCounted) {
+  const ScratchFolder folder;
+  EventBus events;
+  for (const char* count : {"1e300", "-9223372036854775808", "\"many\"", "null", "2.5"}) {
+    std::ofstream(folder.path() / "a.json")
+        << R"({"id": "a", "state": "queued", "interrupted": )" << count << R"(, "died": )" << count << "}";
+    const auto queue = JobQueue::open(folder.path(), events);
+    ASSERT_TRUE(queue);
+    const auto job = (*queue)->find("a");
+    ASSERT_TRUE(job) << count;
+    EXPECT_EQ(job->state, JobState::queued) << count;
+    EXPECT_EQ(job->died, 0) << count;
+    EXPECT_LE(job->interrupted, 1) << count;
+  }
+}
+
 TEST(JobQueue, AJobThatIsThereWheneverTheDaemonDiesFailsAtLast) {
   const ScratchFolder folder;
   EventBus events;

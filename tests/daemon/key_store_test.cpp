@@ -97,6 +97,15 @@ TEST_F(KeyStoreTest, NothingIsLostThatComesWhileTheJournalIsWrittenAnew) {
   for (int i = 0; i < kept; ++i) EXPECT_TRUE(knows(ended + i)) << i;
 }
 
+TEST_F(KeyStoreTest, ATimeThatIsNoneIsDropped) {
+  for (const char* until : {"1e300", "-1", "9223372036854775807", "18446744073709551615", "\"soon\"", "null"})
+    std::ofstream(file_, std::ios::app) << R"({"key": "press-1", "digest": "d", "result": "{}", "until": )" << until
+                                        << "}\n";
+  open();
+  EXPECT_FALSE(knows(1));
+  EXPECT_EQ(lines(), 0U);
+}
+
 TEST_F(KeyStoreTest, ALineThatWasTornIsDroppedAndTheSuccessorOfAKilledProcessToo) {
   open();
   remember(1);

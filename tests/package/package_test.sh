@@ -58,8 +58,20 @@ read -ra command <<<"$exec_start"
 sed -e "s|^state_directory = .*|state_directory = \"$scratch/state\"|" -e "s|ipc:///run/booth|ipc://$scratch|" \
   -e "s|/usr/share/avatar-booth|$root&|" -e 's|^reserve_mib = [0-9]*|reserve_mib = 0|' \
   "$root${command[2]}" >"$scratch/boothd.toml"
-"$root${command[0]}" --config "$scratch/boothd.toml" 2>"$scratch/boothd.log" &
-boothd=$!
+start() {
+  "$root${command[0]}" --config "$scratch/boothd.toml" 2>>"$scratch/boothd.log" &
+  boothd=$!
+}
+# @param 1  what holds after a while
+await() {
+  for _ in $(seq 600); do
+    if eval "$1"; then return; fi
+    sleep 0.2
+  done
+  cat "$scratch/boothd.log"
+  fail "never: $1"
+}
+start
 ask() { "$root/usr/bin/boothctl" --control "ipc://$scratch/control" --events "ipc://$scratch/events" --timeout 60 "$@"; }
 ask --json status >"$scratch/status" || { cat "$scratch/boothd.log"; fail "the installed booth does not answer"; }
 grep -q '"boot"' "$scratch/status" || fail "no status"
@@ -77,7 +89,22 @@ dpkg-deb -R "$deb" "$scratch/next"
 sed -i 's/^Version: .*/&+1/' "$scratch/next/DEBIAN/control"
 echo '# of the new version' >>"$scratch/next/etc/booth/boothd.toml"
 dpkg-deb --root-owner-group -b "$scratch/next" "$scratch/next.deb" >/dev/null
+# In the middle of a queue: the old program runs on while the new one is installed, and then makes room for it.
+start
+await 'ask capture --face none >"$scratch/first" 2>/dev/null'
+await 'ask capture --face none >"$scratch/second" 2>/dev/null'
+await 'ask jobs | grep -q " running "'
 install -i "$scratch/next.deb"
+kill "$boothd"
+wait "$boothd" || { cat "$scratch/boothd.log"; fail "the old booth did not end well"; }
+start
+await '[ "$(ask jobs | grep -c " done ")" = 2 ]'
+for id in "$scratch/first" "$scratch/second"; do
+  [ "$(ask avatars list | grep -c "^$(cat "$id") ")" = 1 ] || fail "$(cat "$id") was lost in the upgrade"
+done
+[ "$(ask avatars list | wc -l)" = 2 ] || fail "there are other avatars than were taken"
+ask shutdown
+wait "$boothd" || { cat "$scratch/boothd.log"; fail "the new booth did not end well"; }
 grep -qx '# mine' "$config" || fail "the operator's configuration was replaced"
 cmp -s "$scratch/older.toml" "$config.bak-1" || fail "the configuration of before is not kept"
 grep -qx 'version = 2' "$config" || fail "the configuration was not migrated"
