@@ -28,6 +28,7 @@ struct IdentityConfig {
   std::filesystem::path backgrounds() const { return state_directory / "backgrounds"; }
   std::filesystem::path jobs() const { return state_directory / "jobs"; }
   std::filesystem::path captures_under_way() const { return state_directory / "capturing"; }
+  std::filesystem::path cache() const { return state_directory / "cache"; }
   std::filesystem::path avatars() const { return state_directory / "avatars"; }
   std::filesystem::path rig() const { return state_directory / "calibration" / "rig.json"; }
 };

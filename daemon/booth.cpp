@@ -94,6 +94,7 @@ Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<D
       JobRunnerOptions{.command = options.reconstruct_command,
                        .config_file = options.config_file,
                        .recordings = config.booth.recordings(),
+                       .cache = config.booth.cache(),
                        .workers = config.jobs.workers,
                        .threads = config.jobs.threads,
                        .timeout = std::chrono::seconds(config.jobs.timeout_s),
@@ -634,6 +635,13 @@ void Booth::note_health() {
   });
 }
 
+void Booth::prepare_background() {
+  const auto background = backgrounds_->current();
+  if (background == nullptr || background->folder == prepared_) return;
+  prepared_ = background->folder;
+  runner_->prepare(prepared_);
+}
+
 void Booth::keep_house(const std::stop_token& stop) {
   auto next_heartbeat = SteadyClock::now(), next_disk = next_heartbeat, next_sweep = next_heartbeat + first_sweep;
   bool disk_was_full = false;
@@ -653,6 +661,7 @@ void Booth::keep_house(const std::stop_token& stop) {
         if (!disk && !disk_was_full) events_.publish(Alert{Severity::error, "disk_full", disk.error().message});
         disk_was_full = !disk;
         tend_background();
+        prepare_background();
         note_health();
       }
       refresh();

@@ -200,6 +200,8 @@ class Booth {
   void sweep() const;
   void keep_house(const std::stop_token& stop);
   std::optional<std::chrono::seconds> background_age() const;
+  /// Has what was learned of the empty booth brought into the form that jobs use. @pre called by the housekeeper
+  void prepare_background();
   void tend_background();
   void note_health();
 
@@ -215,7 +217,8 @@ class Booth {
   std::unique_ptr<AvatarStore> avatars_;
   std::unique_ptr<CaptureJournal> journal_;
   std::unique_ptr<HealthHistory> history_;
-  SerialExecutor disk_executor_;  ///< its tasks use those above
+  SerialExecutor disk_executor_;    ///< its tasks use those above
+  std::filesystem::path prepared_;  ///< the background that was prepared last; the housekeeper's
   std::unique_ptr<BackgroundStore> backgrounds_;
   TaskBoard tasks_{events_};
   mutable std::mutex rig_mutex_;

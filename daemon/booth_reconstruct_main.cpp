@@ -13,6 +13,7 @@
 #include <fstream>
 #include <iostream>
 #include <nlohmann/json.hpp>
+#include <optional>
 #include <stop_token>
 #include <string>
 #include <thread>
@@ -84,8 +85,8 @@ class StopOnSignal {
 };
 
 struct Arguments {
-  std::string recording, avatar, config, face, texture, trace;
-  bool timings = false;
+  std::string recording, avatar, config, face, texture, trace, cache;
+  bool timings = false, learn = false;
   int progress_fd = -1;
   unsigned threads = 0;
 };
@@ -110,7 +111,25 @@ int fail(const ProgressPipe& pipe, const Error& error, int status) {
   return status;
 }
 
+/// Learns the empty booth into the cache, and no more.
+int learn(const Arguments& arguments) {
+  const auto recording = read_recording(arguments.recording);
+  const Shot* background = recording ? recording->find(ShotRole::background) : nullptr;
+  if (background == nullptr) {
+    std::cerr << "booth-reconstruct: "
+              << (recording ? "recording.json: shots has none with the role background" : recording.error().message)
+              << "\n";
+    return exit_failed;
+  }
+  ThreadPool pool(arguments.threads);
+  const EmptyViewStore kept(arguments.cache);
+  const LearnedBooth learned = learn_background(*recording, *background, &kept, pool.work());
+  for (const std::string& fault : learned.faults) std::cerr << "warning: " << fault << "\n";
+  return 0;
+}
+
 int run(const Arguments& arguments) {
+  if (arguments.learn) return learn(arguments);
   const ProgressPipe pipe(arguments.progress_fd);
   BoothConfig config;
   if (!arguments.config.empty()) {
@@ -130,6 +149,8 @@ int run(const Arguments& arguments) {
   work.stop = stop.token();
   ProgressBar bar;
   const bool draw = isatty(STDERR_FILENO) != 0 && arguments.progress_fd < 0;
+  std::optional<EmptyViewStore> kept;
+  if (!arguments.cache.empty()) kept.emplace(arguments.cache);
   FaceModelLoader face_model(config.face.landmark_model);
   // Beside the stages that come before it, so that it need not be waited for.
   if (const auto recording = read_recording(arguments.recording);
@@ -143,7 +164,7 @@ int run(const Arguments& arguments) {
         if (draw) bar.draw(stage, fraction);
         pipe.tell({{"stage", stage}, {"fraction", fraction}});
       },
-      [&](const std::vector<CameraHealth>& cameras) { tell_health(pipe, cameras); });
+      [&](const std::vector<CameraHealth>& cameras) { tell_health(pipe, cameras); }, kept ? &*kept : nullptr);
   bar.clear();
   if (!arguments.trace.empty() && !(std::ofstream(arguments.trace) << trace.json() << std::flush))
     std::cerr << "warning: " << arguments.trace << ": the trace cannot be written\n";
@@ -171,7 +192,7 @@ int main(int argc, char** argv) {
   booth::Arguments arguments;
   CLI::App app("Makes a rigged, textured avatar from a recorded capture.", "booth-reconstruct");
   app.add_option("RECORDING", arguments.recording, "folder in the recording format")->required();
-  app.add_option("OUT_DIR", arguments.avatar, "where the avatar's folder will appear")->required();
+  auto* avatar = app.add_option("OUT_DIR", arguments.avatar, "where the avatar's folder will appear");
   app.add_option("--face", arguments.face, "how the face is made")
       ->check(CLI::IsMember({"active", "passive", "none", "auto"}));
   app.add_option("--texture", arguments.texture, "how the photographs become one texture")
@@ -180,6 +201,11 @@ int main(int argc, char** argv) {
   app.add_flag("--timings", arguments.timings, "print the seconds of each stage as JSON");
   app.add_option("--trace", arguments.trace,
                  "write where time and memory went to this file, for ui.perfetto.dev or chrome://tracing");
+  auto* cache = app.add_option("--cache", arguments.cache,
+                               "folder in which what was learned of the empty booth is kept for the next job");
+  auto* learn = app.add_flag("--learn", arguments.learn, "learn the empty booth into the cache, make no avatar")
+                    ->needs(cache)
+                    ->excludes(avatar);
   app.add_option("--threads", arguments.threads, "how many to use; 0 for as many as there are processors")
       ->check(CLI::Range(0, 1024));
   app.add_option("--progress-fd", arguments.progress_fd,
@@ -187,6 +213,7 @@ int main(int argc, char** argv) {
   app.set_version_flag("--version", BOOTH_VERSION);
   try {
     app.parse(argc, argv);
+    if (learn->empty() && avatar->empty()) throw CLI::RequiredError("OUT_DIR");
   } catch (const CLI::ParseError& e) {
     const int status = app.exit(e);
     return status == 0 ? 0 : booth::exit_usage;

@@ -108,7 +108,10 @@ void JobRunner::work(const std::stop_token& stop, Pulse& pulse) {
   while (!stop.stop_requested()) {
     pulse.beat();
     const auto lease = jobs_.take(stop, patience);
-    if (!lease) continue;
+    if (!lease) {
+      learn(stop, pulse);
+      continue;
+    }
     try {
       run(*lease, stop, pulse);
     } catch (const std::exception& fault) {
@@ -117,6 +120,34 @@ void JobRunner::work(const std::stop_token& stop, Pulse& pulse) {
       persist(lease->job.id);
     }
     jobs_.release(*lease);
+  }
+}
+
+void JobRunner::prepare(const std::filesystem::path& recording) {
+  if (options_.cache.empty()) return;
+  const std::lock_guard lock(mutex_);
+  to_learn_ = recording;
+}
+
+void JobRunner::learn(const std::stop_token& stop, Pulse& pulse) {
+  std::filesystem::path recording;
+  {
+    const std::lock_guard lock(mutex_);
+    recording = std::exchange(to_learn_, {});
+  }
+  if (recording.empty()) return;
+  auto child = ChildProcess::start({options_.command, recording, "--learn", "--cache", options_.cache});
+  if (!child) return spdlog::warn("the background is not prepared: {}", child.error().message);
+  const auto deadline = SteadyClock::now() + options_.timeout;
+  Tail output;
+  for (;;) {
+    pulse.beat();
+    pollfd polled{child->output(), POLLIN, 0};
+    ::poll(&polled, 1, static_cast<int>(step.count()));
+    output.read(child->output());
+    const auto status = child->poll_status();
+    if (status && *status != 0) spdlog::warn("the background is not prepared: {}", output.last_line());
+    if (status || stop.stop_requested() || SteadyClock::now() >= deadline) return;
   }
 }
 
@@ -139,6 +170,7 @@ void JobRunner::run(const JobQueue::Lease& lease, const std::stop_token& stop, P
   std::vector<std::string> command{options_.command, options_.recordings / id, avatars_.folder() / id};
   command.insert(command.end(), {"--progress-fd", "3", "--threads", std::to_string(options_.threads)});
   if (!lease.job.face.empty()) command.insert(command.end(), {"--face", lease.job.face});
+  if (!options_.cache.empty()) command.insert(command.end(), {"--cache", options_.cache});
   if (!options_.config_file.empty()) command.insert(command.end(), {"--config", options_.config_file});
 
   Run run;

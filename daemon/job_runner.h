@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <filesystem>
 #include <functional>
+#include <mutex>
 #include <string>
 #include <thread>
 #include <vector>
@@ -22,6 +23,7 @@ struct JobRunnerOptions {
   std::filesystem::path command;      ///< the program that reconstructs: COMMAND RECORDING AVATAR --face MODE …
   std::filesystem::path config_file;  ///< handed to it; may be empty
   std::filesystem::path recordings;
+  std::filesystem::path cache;  ///< folder that it may keep things in from one job to the next; empty: none
   int workers = 1;
   int threads = 0;  ///< of one reconstruction; 0: as many as there are processors
   std::chrono::milliseconds timeout{300'000};
@@ -45,6 +47,10 @@ class JobRunner {
             OnHealth on_health = {});
   ~JobRunner();
 
+  /// Has a worker that finds no job learn the background of this recording into the cache (COMMAND RECORDING --learn
+  /// --cache FOLDER), so that the next visitor need not wait for that. Returns at once.
+  void prepare(const std::filesystem::path& recording);
+
   /// Kills what runs; those jobs go back into the queue. Waits for that.
   void stop();
 
@@ -58,6 +64,8 @@ class JobRunner {
   void conclude(const JobQueue::Lease& lease, const Run& run);
   void publish(const JobQueue::Lease& lease);
   void persist(const std::string& job);
+  /// Learns what prepare() named last, until there is a job to do.
+  void learn(const std::stop_token& stop, Pulse& pulse);
 
   const JobRunnerOptions options_;
   JobQueue& jobs_;
@@ -66,6 +74,8 @@ class JobRunner {
   Metrics& metrics_;
   const OnHealth on_health_;
   std::vector<Pulse> pulses_;  ///< one a worker
+  std::mutex mutex_;
+  std::filesystem::path to_learn_;  ///< guarded by mutex_; empty: nothing
   std::vector<std::jthread> workers_;
 };
 

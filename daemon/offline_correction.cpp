@@ -41,10 +41,12 @@ Seen look_at(const Rig& rig, const std::vector<FrameSet>& background, const Fram
       if (!developed) return {{}, {}, developed.error().message};
       empty.push_back(std::move(*developed));
     }
-  auto segmentation = segment(empty, *frame, {});
+  const auto view = learn_empty_view(empty);
+  if (!view) return {{}, {}, view.error().message};
+  auto segmentation = segment(*view, *frame, {});
   if (!segmentation) return {{}, {}, segmentation.error().message};
   if (const RigCamera* camera = rig.find(raw.camera)) {
-    const auto motion = register_background(empty, *frame, segmentation->silhouette.coverage, camera->intrinsics);
+    const auto motion = register_background(view->mean, *frame, segmentation->silhouette.coverage, camera->intrinsics);
     if (motion) seen.motion = *motion;
   }
   seen.silhouette = std::move(segmentation->silhouette);

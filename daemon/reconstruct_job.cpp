@@ -45,10 +45,12 @@ class StageClock {
     progress_(under_way == stages_.end() ? stage : under_way->name, std::min(done / total_, 1.0));
   }
 
-  /// Each stage's seconds, in the order in which they began; so far, where one is under way.
+  /// The seconds of each stage that began, in the order of job_stages(); so far, where one is under way.
   std::vector<std::pair<std::string, double>> times() const {
     std::vector<std::pair<std::string, double>> times;
-    for (const Stage& s : stages_) times.emplace_back(s.name, s.seconds ? *s.seconds : seconds_since(s.began));
+    for (const std::string& name : job_stages())
+      for (const Stage& s : stages_)
+        if (s.name == name) times.emplace_back(name, s.seconds ? *s.seconds : seconds_since(s.began));
     return times;
   }
 
@@ -90,16 +92,17 @@ void append(std::vector<std::string>* to, const std::vector<std::string>& from) 
 }
 
 /// The decoded shots that the reconstruction needs; what could not be used is said in `warnings`.
-Result<CaptureFrames> load_capture(const Recording& recording, FaceMode face, const Work& work,
-                                   std::vector<std::string>* warnings) {
+Result<CaptureFrames> load_capture(const Recording& recording, FaceMode face, const EmptyViewStore* kept,
+                                   const Work& work, std::vector<std::string>* warnings) {
   const Shot* body = recording.find(ShotRole::body);
   if (body == nullptr) return Error{ErrorCode::no_subject, "recording.json: shots has none with the role body"};
   CaptureFrames capture;
   capture.rig = recording.rig;
   if (const Shot* background = recording.find(ShotRole::background)) {
-    LoadedShot loaded = load_shot(recording, *background, work);
-    append(warnings, loaded.faults);
-    capture.background = std::move(loaded.sets);
+    const Step step(work, "load: empty booth");
+    LearnedBooth learned = learn_background(recording, *background, kept, work);
+    append(warnings, learned.faults);
+    capture.background = std::move(learned.views);
   } else {
     return Error{ErrorCode::no_background, "recording.json: shots has none with the role background"};
   }
@@ -141,7 +144,8 @@ const std::vector<std::string>& job_stages() {
 Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_folder,
                                         const std::filesystem::path& avatar, const ReconstructionOptions& options,
                                         const FaceSources& sources, const AvatarFileOptions& files, const Work& work,
-                                        const JobProgress& progress, const HealthReport& health) {
+                                        const JobProgress& progress, const HealthReport& health,
+                                        const EmptyViewStore* kept) {
   // A trailing slash names the same folder.
   const std::filesystem::path target = avatar.has_filename() ? avatar : avatar.parent_path();
   const std::filesystem::path parent = target.has_parent_path() ? target.parent_path() : ".";
@@ -157,7 +161,7 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
   JobReport report;
   auto capture = [&] {
     const Step step(work, "load");
-    return load_capture(*recording, options.face, work, &report.warnings);
+    return load_capture(*recording, options.face, kept, work, &report.warnings);
   }();
   if (work.stopped()) return Work::cancelled();
   if (!capture) return capture.error();

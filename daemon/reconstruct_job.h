@@ -7,6 +7,7 @@
 #include <utility>
 #include <vector>
 
+#include "daemon/empty_view_store.h"
 #include "pipeline/export/avatar_files.h"
 #include "pipeline/reconstruct.h"
 #include "pipeline/types/work.h"
@@ -21,7 +22,7 @@ const std::vector<std::string>& job_stages();
 using JobProgress = std::function<void(std::string_view stage, double fraction)>;
 
 struct JobReport {
-  std::vector<std::pair<std::string, double>> stage_seconds;  ///< in the order they began; stages may overlap
+  std::vector<std::pair<std::string, double>> stage_seconds;  ///< of job_stages() that ran; they may overlap
   std::vector<std::string> warnings;                          ///< as in the metadata
 };
 
@@ -34,12 +35,14 @@ struct JobReport {
 /// @param sources    as reconstruct() wants them
 /// @param files      which files the folder gets
 /// @param work       its progress is not used
+/// @param kept       where what was learned of the empty booth is kept; nullptr: it is learned each time
 /// @error what read_recording and reconstruct return; no_background and no_subject for a recording without these
 ///        shots; invalid_argument when `avatar` is no plain name; invalid_state when something else is there; io,
 ///        disk_full
 Result<JobReport> reconstruct_recording(const std::filesystem::path& recording, const std::filesystem::path& avatar,
                                         const ReconstructionOptions& options, const FaceSources& sources,
                                         const AvatarFileOptions& files, const Work& work,
-                                        const JobProgress& progress = {}, const HealthReport& health = {});
+                                        const JobProgress& progress = {}, const HealthReport& health = {},
+                                        const EmptyViewStore* kept = nullptr);
 
 }  // namespace booth

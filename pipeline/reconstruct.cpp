@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -69,20 +70,9 @@ struct SegmentedViews {
   std::vector<CameraHealth> health;  ///< in the order of the silhouettes
 };
 
-/// The frames of the empty booth that a camera took, in the order of their repetitions.
-std::vector<Frame> background_of(const std::string& camera, std::span<const FrameSet> background) {
-  std::vector<Frame> frames;
-  for (const FrameSet& set : background)
-    for (const Frame& frame : set.frames)
-      if (frame.camera == camera) frames.push_back(frame);
-  return frames;
-}
-
 /// Develops a capture's raw frames where they are. @error invalid_argument  as develop
 Result<void> develop_all(CaptureFrames& capture, const Work& work) {
   std::vector<Frame*> frames;
-  for (FrameSet& set : capture.background)
-    for (Frame& frame : set.frames) frames.push_back(&frame);
   for (Frame& frame : capture.body.frames) frames.push_back(&frame);
   if (capture.face)
     for (FrameSet& set : capture.face->sets)
@@ -111,13 +101,16 @@ struct SegmentedView {
 };
 Result<SegmentedView> look_at(const CaptureFrames& capture, const Frame& frame, const SegmentationOptions& options,
                               const Work& work) {
-  const std::vector<Frame> background = background_of(frame.camera, capture.background);
-  auto segmentation = segment(background, frame, options, work);
+  const auto empty = std::find_if(capture.background.begin(), capture.background.end(),
+                                  [&](const EmptyView& view) { return view.camera == frame.camera; });
+  if (empty == capture.background.end())
+    return Error{ErrorCode::no_background, "camera " + frame.camera + ": no background frame"};
+  auto segmentation = segment(*empty, frame, options, work);
   if (!segmentation) return segmentation.error();
   BackgroundMotion motion;
   if (const RigCamera* camera = capture.rig.find(frame.camera)) {
     const auto registered =
-        register_background(background, frame, segmentation->silhouette.coverage, camera->intrinsics);
+        register_background(empty->mean, frame, segmentation->silhouette.coverage, camera->intrinsics);
     if (!registered) return registered.error();
     motion = *registered;
   }
@@ -393,6 +386,35 @@ std::optional<FaceMode> face_mode_from(std::string_view name) {
 }
 
 bool wants_scan(FaceMode mode) { return mode == FaceMode::active || mode == FaceMode::automatic; }
+
+EmptyBooth learn_empty_booth(std::span<const FrameSet> background, const Work& work) {
+  std::map<std::string, std::vector<const Frame*>> by_camera;
+  for (const FrameSet& set : background)
+    for (const Frame& frame : set.frames) by_camera[frame.camera].push_back(&frame);
+  const std::vector<std::pair<std::string, std::vector<const Frame*>>> cameras(by_camera.begin(), by_camera.end());
+  std::vector<std::optional<Result<EmptyView>>> learned(cameras.size());
+  work.parallel_for(cameras.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t i = begin; i < end; ++i) {
+      std::vector<Frame> frames;
+      for (const Frame* frame : cameras[i].second) {
+        auto developed = develop(*frame);
+        if (!developed) {
+          learned[i] = developed.error();
+          break;
+        }
+        frames.push_back(std::move(*developed));
+      }
+      if (!learned[i]) learned[i] = learn_empty_view(frames);
+    }
+  });
+  EmptyBooth booth;
+  for (auto& view : learned)
+    if (*view)
+      booth.views.push_back(std::move(**view));
+    else
+      booth.faults.push_back(view->error().message);
+  return booth;
+}
 
 const std::vector<std::string>& reconstruction_stages() {
   static const std::vector<std::string> stages{"segmentation", "hull",  "refine",   "face",

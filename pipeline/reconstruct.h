@@ -3,6 +3,7 @@
 #include <functional>
 #include <memory>
 #include <optional>
+#include <span>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -25,6 +26,7 @@
 #include "pipeline/surface/smoothing.h"
 #include "pipeline/types/avatar.h"
 #include "pipeline/types/camera_health.h"
+#include "pipeline/types/empty_view.h"
 #include "pipeline/types/frame.h"
 #include "pipeline/types/rig.h"
 #include "pipeline/types/work.h"
@@ -59,10 +61,10 @@ struct ReconstructionOptions {
   SkinningOptions skinning;
 };
 
-/// A capture, decoded. Raw frames (Frame::mosaic) are developed first.
+/// A capture, decoded. Its raw frames (Frame::mosaic) are developed first.
 struct CaptureFrames {
   Rig rig;
-  std::vector<FrameSet> background;          ///< the empty booth, one set a repetition
+  std::vector<EmptyView> background;         ///< the empty booth, by camera
   FrameSet body;                             ///< the subject, one trigger
   std::optional<GrayCodeCapture> face = {};  ///< the face under structured light, where it was taken
   std::optional<Mesh> face_scan = {};        ///< another scanner's face, see place_external_scan; used before `face`
@@ -95,6 +97,15 @@ struct Reconstruction {
   std::vector<std::string> cameras;   ///< ids of those that shaped it
   std::vector<std::string> warnings;  ///< sentences for an operator
 };
+
+/// What each camera saw of the empty booth, and a sentence for each whose frames cannot be used.
+struct EmptyBooth {
+  std::vector<EmptyView> views;
+  std::vector<std::string> faults;
+};
+
+/// @param background  frames of the empty booth, one set a repetition; raw ones are developed
+EmptyBooth learn_empty_booth(std::span<const FrameSet> background, const Work& work = {});
 
 /// The names of the stages in their order.
 const std::vector<std::string>& reconstruction_stages();

@@ -64,21 +64,20 @@ struct Level {
   }
 };
 
-/// The mean lightness of the images in squares of `step` pixels; of colours the green, which is the least noisy.
-std::vector<float> lightness_of(std::span<const Image* const> images, int step, int width, int height) {
+/// The lightness of the image's mean in squares of `step` pixels; of colours the green, which is the least noisy.
+std::vector<float> lightness_of(const Image& image, int step, int width, int height) {
   std::vector<float> lightness(static_cast<size_t>(width) * static_cast<size_t>(height));
-  const int channels = images.front()->channels;
+  const int channels = image.channels;
   const int channel = channels == 3 ? 1 : 0;
-  const float weight = 1.0F / static_cast<float>(static_cast<size_t>(step * step) * images.size());
+  const float weight = 1.0F / static_cast<float>(step * step);
   std::vector<int> sums(static_cast<size_t>(width));
   for (int y = 0; y < height; ++y) {
     std::fill(sums.begin(), sums.end(), 0);
-    for (const Image* image : images)
-      for (int dy = 0; dy < step; ++dy) {
-        const uint8_t* samples = image->pixel(0, y * step + dy) + channel;
-        for (int& sum : sums)
-          for (int dx = 0; dx < step; ++dx, samples += channels) sum += *samples;
-      }
+    for (int dy = 0; dy < step; ++dy) {
+      const uint8_t* samples = image.pixel(0, y * step + dy) + channel;
+      for (int& sum : sums)
+        for (int dx = 0; dx < step; ++dx, samples += channels) sum += *samples;
+    }
     float* row = lightness.data() + static_cast<size_t>(y) * static_cast<size_t>(width);
     for (size_t x = 0; x < sums.size(); ++x) row[x] = std::log(static_cast<float>(sums[x]) * weight + srgb_offset);
   }
@@ -341,18 +340,14 @@ class Registration {
   std::vector<Sample> samples_;
 };
 
-Result<void> check(std::span<const Frame> background, const Frame& frame, const Image& subject,
-                   const Intrinsics& intrinsics) {
+Result<void> check(const Image& empty_booth, const Frame& frame, const Image& subject, const Intrinsics& intrinsics) {
   const auto fault = [&](const std::string& what) {
     return Error{ErrorCode::invalid_argument, "camera " + frame.camera + ": " + what};
   };
-  if (background.empty()) return fault("no picture of the empty booth");
   if (!frame.pixels || frame.pixels->empty()) return fault("its picture is empty");
   const Image& image = *frame.pixels;
-  for (const Frame& empty : background)
-    if (!empty.pixels || empty.pixels->width != image.width || empty.pixels->height != image.height ||
-        empty.pixels->channels != image.channels)
-      return fault("its picture of the empty booth has another size or other channels than its capture");
+  if (empty_booth.width != image.width || empty_booth.height != image.height || empty_booth.channels != image.channels)
+    return fault("its picture of the empty booth has another size or other channels than its capture");
   if (!subject.empty() && (subject.width != image.width || subject.height != image.height || subject.channels != 1))
     return fault("the subject's coverage has another size than the picture");
   if (intrinsics.width != image.width || intrinsics.height != image.height)
@@ -362,19 +357,17 @@ Result<void> check(std::span<const Frame> background, const Frame& frame, const 
 
 }  // namespace
 
-Result<BackgroundMotion> register_background(std::span<const Frame> background, const Frame& frame,
-                                             const Image& subject, const Intrinsics& intrinsics) {
-  if (const auto valid = check(background, frame, subject, intrinsics); !valid) return valid.error();
+Result<BackgroundMotion> register_background(const Image& empty_booth, const Frame& frame, const Image& subject,
+                                             const Intrinsics& intrinsics) {
+  if (const auto valid = check(empty_booth, frame, subject, intrinsics); !valid) return valid.error();
   const Image& image = *frame.pixels;
   const int step =
       std::max(1, static_cast<int>(std::sqrt(static_cast<double>(image.width) * image.height / fewest_samples)));
-  std::vector<const Image*> empty;
-  for (const Frame& one : background) empty.push_back(one.pixels.get());
   std::vector<Level> pyramid(1);
   pyramid[0].width = image.width / step;
   pyramid[0].height = image.height / step;
-  pyramid[0].background = lightness_of(empty, step, pyramid[0].width, pyramid[0].height);
-  pyramid[0].frame = lightness_of(std::vector<const Image*>{&image}, step, pyramid[0].width, pyramid[0].height);
+  pyramid[0].background = lightness_of(empty_booth, step, pyramid[0].width, pyramid[0].height);
+  pyramid[0].frame = lightness_of(image, step, pyramid[0].width, pyramid[0].height);
   pyramid[0].open = open_places(subject, step, pyramid[0].width, pyramid[0].height);
   while (std::min(pyramid.back().width, pyramid.back().height) >= 2 * coarsest_side)
     pyramid.push_back(halved(pyramid.back()));

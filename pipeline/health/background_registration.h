@@ -1,7 +1,6 @@
 #pragma once
 
 #include <Eigen/Core>
-#include <span>
 
 #include "pipeline/types/frame.h"
 #include "pipeline/types/result.h"
@@ -32,17 +31,17 @@ struct BackgroundMotion {
 /// things that were moved in it, have little say. How certain the motion is comes from how much the parts of the
 /// picture disagree on it: a blank wall tells nothing, and says so.
 ///
-/// @param background  one or more frames of the empty booth
+/// @param empty_booth what the camera saw of it before
 /// @param frame       of the same camera, size and channels; 8 bit grey or RGB, distorted pixels, as captured
 /// @param subject     coverage of the frame's size, above 0 where the subject is; empty: nobody is there
 /// @param intrinsics  of the frame's size
-/// @error invalid_argument  no background, or sizes or channels that differ
-/// Cost: O(pixels × frames) once, then a few passes over at most 29,000 samples a level.
+/// @error invalid_argument  sizes or channels that differ
+/// Cost: O(pixels) once, then a few passes over at most 29,000 samples a level.
 /// Source: B. Lucas, T. Kanade, "An iterative image registration technique with an application to stereo vision", IJCAI
 /// 1981; coarse to fine and robust: M. Black, P. Anandan, "The robust estimation of multiple motions", CVIU 63(1),
 /// 1996; the covariance, clustered by parts of the picture: H. White, "A heteroskedasticity-consistent covariance
 /// matrix estimator", Econometrica 48(4), 1980.
-Result<BackgroundMotion> register_background(std::span<const Frame> background, const Frame& frame,
-                                             const Image& subject, const Intrinsics& intrinsics);
+Result<BackgroundMotion> register_background(const Image& empty_booth, const Frame& frame, const Image& subject,
+                                             const Intrinsics& intrinsics);
 
 }  // namespace booth

@@ -427,58 +427,71 @@ CellFrame average_cells(const Image& image, const CellGrid& grid, const PixelOff
   return frame;
 }
 
-BackgroundModel learn_background(std::span<const Frame> frames, const PixelOffset& offset) {
+EmptyView learn_view(std::span<const Frame> frames) {
   const Image& first = *frames[0].pixels;
-  BackgroundModel model;
-  model.grid = make_grid(first.width, first.height);
-  model.offset = offset;
-  if (frames.size() == 1) {
-    CellFrame only = average_cells(first, model.grid, offset);
-    model.lightness = std::move(only.lightness);
-    model.level = std::move(only.level);
-    return model;
+  EmptyView view{frames[0].camera, first, {}};
+  if (frames.size() == 1) return view;
+
+  const auto count = static_cast<uint32_t>(frames.size());
+  std::vector<uint16_t> total(static_cast<size_t>(first.width) * static_cast<size_t>(first.channels));
+  for (int y = 0; y < first.height; ++y) {
+    std::fill(total.begin(), total.end(), uint16_t{0});
+    for (const Frame& frame : frames) {
+      const uint8_t* row = frame.pixels->pixel(0, y);
+      for (size_t i = 0; i < total.size(); ++i) total[i] = static_cast<uint16_t>(total[i] + row[i]);
+    }
+    uint8_t* mean = view.mean.pixel(0, y);
+    for (size_t i = 0; i < total.size(); ++i) mean[i] = static_cast<uint8_t>((total[i] + count / 2) / count);
   }
-  const CellGrid& grid = model.grid;
-  const int channels = first.channels;
-  const size_t cell_pixels = static_cast<size_t>(grid.step) * static_cast<size_t>(grid.step);
-  const std::vector<float> table = lightness_table(cell_pixels * frames.size());
-  model.lightness = make_planes(channels, grid.count());
-  model.level = make_planes(channels, grid.count());
-  model.flicker.assign(grid.count(), 0);
-  const auto n = static_cast<float>(frames.size());
-  const float per_cell = 1.0F / static_cast<float>(cell_pixels);
-  const float spread_scale = per_cell * per_cell / (n - 1) / static_cast<float>(channels);
-  std::vector<CellRow> rows(frames.size(), CellRow(grid, channels));
-  std::vector<uint32_t> total(static_cast<size_t>(grid.width));
-  std::vector<float> shift(total.size()), squares(total.size());
+
+  const CellGrid grid = make_grid(first.width, first.height);
+  view.flicker.assign(grid.count(), 0);
+  const auto n = static_cast<float>(count);
+  const float per_cell = 1.0F / static_cast<float>(grid.step * grid.step);
+  const float spread_scale = per_cell * per_cell / (n - 1) / static_cast<float>(first.channels);
+  std::vector<CellRow> rows(frames.size(), CellRow(grid, first.channels));
+  std::vector<float> shift(static_cast<size_t>(grid.width)), squares(shift.size());
   for (int y = 0; y < grid.height; ++y) {
-    for (size_t f = 0; f < frames.size(); ++f) rows[f].add_up(*frames[f].pixels, y, offset);
-    float* flicker = model.flicker.data() + grid.index(0, y);
-    for (int c = 0; c < channels; ++c) {
+    for (size_t f = 0; f < frames.size(); ++f) rows[f].add_up(*frames[f].pixels, y, {});
+    float* flicker = view.flicker.data() + grid.index(0, y);
+    for (int c = 0; c < first.channels; ++c) {
       // Differences to the first frame are small, so that little is lost in the variance's difference of squares.
       const std::vector<uint16_t>& reference = rows[0].sums(static_cast<size_t>(c));
-      std::copy(reference.begin(), reference.end(), total.begin());
       std::fill(shift.begin(), shift.end(), 0.0F);
       std::fill(squares.begin(), squares.end(), 0.0F);
       for (size_t f = 1; f < frames.size(); ++f) {
         const std::vector<uint16_t>& sums = rows[f].sums(static_cast<size_t>(c));
-        for (size_t x = 0; x < total.size(); ++x) {
+        for (size_t x = 0; x < shift.size(); ++x) {
           const auto difference = static_cast<float>(int{sums[x]} - int{reference[x]});
-          total[x] += sums[x];
           shift[x] += difference;
           squares[x] += difference * difference;
         }
       }
-      float* lightness = model.lightness.values[c].data() + grid.index(0, y);
-      float* level = model.level.values[c].data() + grid.index(0, y);
-      for (size_t x = 0; x < total.size(); ++x) lightness[x] = table[total[x]];
-      for (size_t x = 0; x < total.size(); ++x)
-        level[x] = static_cast<float>(static_cast<int32_t>(total[x])) * (per_cell / n);
-      for (size_t x = 0; x < total.size(); ++x)
+      for (size_t x = 0; x < shift.size(); ++x)
         flicker[x] += std::max(0.0F, squares[x] - shift[x] * shift[x] / n) * spread_scale;
     }
   }
-  box_mean_3x3(model.flicker, grid.width, grid.height);
+  box_mean_3x3(view.flicker, grid.width, grid.height);
+  return view;
+}
+
+BackgroundModel model_background(const EmptyView& empty, const PixelOffset& offset) {
+  BackgroundModel model;
+  model.grid = make_grid(empty.mean.width, empty.mean.height);
+  model.offset = offset;
+  CellFrame cells = average_cells(empty.mean, model.grid, offset);
+  model.lightness = std::move(cells.lightness);
+  model.level = std::move(cells.level);
+  if (empty.flicker.size() != model.grid.count()) return model;
+  const auto whole_cells = [&](int px) {
+    return static_cast<int>(std::lround(static_cast<double>(px) / model.grid.step));
+  };
+  const int dx = whole_cells(offset.x), dy = whole_cells(offset.y);
+  model.flicker.resize(model.grid.count());
+  for (int y = 0; y < model.grid.height; ++y)
+    for (int x = 0; x < model.grid.width; ++x)
+      model.flicker[model.grid.index(x, y)] = empty.flicker[model.grid.index(
+          std::clamp(x - dx, 0, model.grid.width - 1), std::clamp(y - dy, 0, model.grid.height - 1))];
   return model;
 }
 

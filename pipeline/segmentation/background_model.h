@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "pipeline/segmentation/cell_grid.h"
+#include "pipeline/types/empty_view.h"
 #include "pipeline/types/frame.h"
 
 namespace booth::segmentation {
@@ -18,7 +19,7 @@ struct PixelOffset {
 struct BackgroundModel {
   CellGrid grid;
   PixelOffset offset;
-  CellPlanes lightness;        ///< log(v + srgb_offset) of the mean over frames and cell
+  CellPlanes lightness;        ///< log(v + srgb_offset) of the mean over the cell
   CellPlanes level;            ///< that mean, 0 … 255
   std::vector<float> flicker;  ///< variance between the frames, mean over channels and 3 × 3 cells, level²;
                                ///< empty when learned from one frame
@@ -27,8 +28,12 @@ struct BackgroundModel {
 /// The mean and spread of the frames.
 ///
 /// @param frames  at least one, all of one size and 1 or 3 channels
-/// @param offset  how far they are moved first; the border repeats
-BackgroundModel learn_background(std::span<const Frame> frames, const PixelOffset& offset = {});
+EmptyView learn_view(std::span<const Frame> frames);
+
+/// The cells of what was learned.
+///
+/// @param offset  how far the view is moved first; the border repeats
+BackgroundModel model_background(const EmptyView& empty, const PixelOffset& offset = {});
 
 /// A frame brought to the model's grid.
 struct CellFrame {

@@ -36,9 +36,9 @@ constexpr float strange_noise = 10;
 /// Keeps quotients of two black surfaces near 1.
 constexpr float dark = 2e-3F;
 
-/// Linear light, 0 … 1, of the mean of so many 8-bit sRGB values, by their sum.
-std::vector<float> linear_light_table(size_t values) {
-  std::vector<float> table(values * 255 + 1);
+/// Linear light, 0 … 1, of 8-bit sRGB values.
+std::vector<float> linear_light_table() {
+  std::vector<float> table(256);
   for (size_t i = 0; i < table.size(); ++i) {
     const double v = static_cast<double>(i) / static_cast<double>(table.size() - 1);
     table[i] = static_cast<float>(v <= 0.04045 ? v / 12.92 : std::pow((v + 0.055) / 1.055, 2.4));
@@ -165,7 +165,7 @@ struct Anchor {
 
 class Matte {
  public:
-  Matte(std::span<const Frame> background, const Image& body, const BackgroundModel& model, const Residual& residual,
+  Matte(const Image& empty_booth, const Image& body, const BackgroundModel& model, const Residual& residual,
         const CellMask& subject)
       : body_(body),
         residual_(residual),
@@ -181,22 +181,18 @@ class Matte {
       seen_[c].resize(band_.size());
       empty_[c].resize(band_.size());
     }
-    const std::vector<float> seen_light = linear_light_table(1);
-    const std::vector<float> empty_light = linear_light_table(background.size());
-    std::vector<uint16_t> sums;
+    const std::vector<float> light = linear_light_table();
+    std::vector<uint8_t> moved;
     for (const Band::Row& row : band_.rows()) {
-      const auto samples = static_cast<size_t>(row.count * channels_);
-      sums.assign(samples, 0);
-      for (const Frame& frame : background) {
-        add_moved(*frame.pixels, row, model.offset, sums);
-      }
+      moved.resize(static_cast<size_t>(row.count * channels_));
+      copy_moved(empty_booth, row, model.offset, moved);
       const uint8_t* in = body.pixel(row.x, row.y);
       for (int c = 0; c < channels_; ++c) {
         float* seen = seen_[c].data() + row.place;
         float* empty = empty_[c].data() + row.place;
         for (int i = 0; i < row.count; ++i) {
-          seen[i] = seen_light[in[i * channels_ + c]];
-          empty[i] = empty_light[sums[static_cast<size_t>(i * channels_ + c)]];
+          seen[i] = light[in[i * channels_ + c]];
+          empty[i] = light[moved[static_cast<size_t>(i * channels_ + c)]];
         }
       }
       float* alpha = alpha_.data() + row.place;
@@ -235,21 +231,19 @@ class Matte {
   }
 
  private:
-  /// Adds the samples that lie under a row of the band when the image is moved by the offset; the border repeats.
-  static void add_moved(const Image& image, const Band::Row& row, const PixelOffset& offset,
-                        std::vector<uint16_t>& sums) {
+  /// The samples that lie under a row of the band when the image is moved by the offset; the border repeats.
+  static void copy_moved(const Image& image, const Band::Row& row, const PixelOffset& offset,
+                         std::vector<uint8_t>& samples) {
     const int y = std::clamp(row.y - offset.y, 0, image.height - 1);
     const int x = row.x - offset.x;
     if (x >= 0 && x + row.count <= image.width) {
       const uint8_t* in = image.pixel(x, y);
-      for (size_t i = 0; i < sums.size(); ++i) sums[i] = static_cast<uint16_t>(sums[i] + in[i]);
+      std::copy(in, in + samples.size(), samples.begin());
       return;
     }
     for (int n = 0; n < row.count; ++n)
-      for (int c = 0; c < image.channels; ++c) {
-        uint16_t& sum = sums[static_cast<size_t>(n * image.channels + c)];
-        sum = static_cast<uint16_t>(sum + image.at(std::clamp(x + n, 0, image.width - 1), y, c));
-      }
+      for (int c = 0; c < image.channels; ++c)
+        samples[static_cast<size_t>(n * image.channels + c)] = image.at(std::clamp(x + n, 0, image.width - 1), y, c);
   }
 
   void find_crossings() {
@@ -468,9 +462,9 @@ void remove_crumbs(Image& coverage, const CellGrid& grid) {
 
 }  // namespace
 
-Image matte(std::span<const Frame> background, const Image& body, const BackgroundModel& model,
-            const Residual& residual, const CellMask& subject) {
-  Matte matte(background, body, model, residual, subject);
+Image matte(const Image& empty_booth, const Image& body, const BackgroundModel& model, const Residual& residual,
+            const CellMask& subject) {
+  Matte matte(empty_booth, body, model, residual, subject);
   for (const Ring& ring : rings) matte.refine(ring);
   Image coverage = matte.coverage();
   remove_crumbs(coverage, model.grid);

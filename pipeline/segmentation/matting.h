@@ -1,10 +1,7 @@
 #pragma once
 
-#include <span>
-
 #include "pipeline/segmentation/background_model.h"
 #include "pipeline/segmentation/labeling.h"
-#include "pipeline/types/frame.h"
 #include "pipeline/types/image.h"
 
 namespace booth::segmentation {
@@ -17,7 +14,9 @@ namespace booth::segmentation {
 /// in sRGB the outline of a dark subject before a bright wall would move outwards by a quarter of its blur.
 /// Where F and B hardly differ the outline known before takes over; pixels of a colour that neither has, such as
 /// highlights along the rim, are subject.
-Image matte(std::span<const Frame> background, const Image& body, const BackgroundModel& model,
-            const Residual& residual, const CellMask& subject);
+///
+/// @param empty_booth  of the body's size and channels; `model` is made of it
+Image matte(const Image& empty_booth, const Image& body, const BackgroundModel& model, const Residual& residual,
+            const CellMask& subject);
 
 }  // namespace booth::segmentation

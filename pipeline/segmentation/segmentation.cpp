@@ -66,21 +66,16 @@ bool holds_its_samples(const Image& image) {
              static_cast<size_t>(image.width) * static_cast<size_t>(image.height) * static_cast<size_t>(image.channels);
 }
 
-Result<void> check(std::span<const Frame> background, const Frame& body) {
-  if (!body.pixels || !holds_its_samples(*body.pixels)) {
+bool same_size(const Image& a, const Image& b) {
+  return a.width == b.width && a.height == b.height && a.channels == b.channels;
+}
+
+Result<void> check(const EmptyView& empty, const Frame& body) {
+  if (!body.pixels || !holds_its_samples(*body.pixels))
     return Error{ErrorCode::invalid_argument, "camera " + body.camera + ": the body frame is no grey or RGB image"};
-  }
-  if (background.empty()) return Error{ErrorCode::no_background, "camera " + body.camera + ": no background frame"};
-  for (const Frame& frame : background) {
-    if (!frame.pixels)
-      return Error{ErrorCode::no_background, "camera " + body.camera + ": a background frame is empty"};
-    if (frame.pixels->width != body.pixels->width || frame.pixels->height != body.pixels->height ||
-        frame.pixels->channels != body.pixels->channels || !holds_its_samples(*frame.pixels)) {
-      return Error{ErrorCode::no_background, "camera " + body.camera + ": a background frame is " +
-                                                 describe(*frame.pixels) + ", the body frame " +
-                                                 describe(*body.pixels)};
-    }
-  }
+  if (!same_size(empty.mean, *body.pixels) || !holds_its_samples(empty.mean))
+    return Error{ErrorCode::no_background, "camera " + body.camera + ": the empty booth was seen as " +
+                                               describe(empty.mean) + ", the body frame is " + describe(*body.pixels)};
   return {};
 }
 
@@ -140,18 +135,43 @@ std::vector<std::string> find_warnings(const Residual& residual, const Labeling&
 
 }  // namespace
 
+Result<EmptyView> learn_empty_view(std::span<const Frame> background) {
+  constexpr size_t most_frames = 256;  // whose sums 16 bits hold
+  if (background.empty()) return Error{ErrorCode::no_background, "no background frame"};
+  const std::string& camera = background.front().camera;
+  const auto fault = [&](const std::string& what) {
+    return Error{ErrorCode::no_background, "camera " + camera + ": " + what};
+  };
+  if (background.size() > most_frames)
+    return fault(std::to_string(background.size()) + " background frames, at most " + std::to_string(most_frames) +
+                 " can be used");
+  for (const Frame& frame : background) {
+    if (!frame.pixels || !holds_its_samples(*frame.pixels)) return fault("a background frame is no grey or RGB image");
+    if (!same_size(*frame.pixels, *background.front().pixels))
+      return fault("a background frame is " + describe(*frame.pixels) + ", another " +
+                   describe(*background.front().pixels));
+  }
+  return segmentation::learn_view(background);
+}
+
 Result<Segmentation> segment(std::span<const Frame> background, const Frame& body, const SegmentationOptions& options,
                              const Work& work) {
-  if (Result<void> ok = check(options); !ok) return ok.error();
-  if (Result<void> ok = check(background, body); !ok) return ok.error();
+  const auto empty = learn_empty_view(background);
+  if (!empty) return empty.error();
+  return segment(*empty, body, options, work);
+}
 
-  BackgroundModel model = segmentation::learn_background(background);
+Result<Segmentation> segment(const EmptyView& empty, const Frame& body, const SegmentationOptions& options,
+                             const Work& work) {
+  if (Result<void> ok = check(options); !ok) return ok.error();
+  if (Result<void> ok = check(empty, body); !ok) return ok.error();
+
+  BackgroundModel model = segmentation::model_background(empty);
   const segmentation::CellFrame cells = segmentation::average_cells(*body.pixels, model.grid);
   Residual residual = segmentation::compare(model, cells);
   for (int n = 0; n < most_realignments && is_misaligned(model, residual); ++n) {
     const auto whole = [](float px) { return static_cast<int>(std::lround(px)); };
-    model =
-        segmentation::learn_background(background, {whole(residual.movement_px[0]), whole(residual.movement_px[1])});
+    model = segmentation::model_background(empty, {whole(residual.movement_px[0]), whole(residual.movement_px[1])});
     residual = segmentation::compare(model, cells);
   }
   if (work.stopped()) return Work::cancelled();
@@ -170,7 +190,7 @@ Result<Segmentation> segment(std::span<const Frame> background, const Frame& bod
 
   Segmentation result;
   result.silhouette.camera = body.camera;
-  result.silhouette.coverage = segmentation::matte(background, *body.pixels, model, residual, labeling.subject);
+  result.silhouette.coverage = segmentation::matte(empty.mean, *body.pixels, model, residual, labeling.subject);
   result.subject_share = covered_share(result.silhouette.coverage);
   result.light_factor = light_factor(residual);
   result.movement_px = std::hypot(residual.movement_px[0], residual.movement_px[1]);

@@ -4,6 +4,7 @@
 #include <string>
 #include <vector>
 
+#include "pipeline/types/empty_view.h"
 #include "pipeline/types/frame.h"
 #include "pipeline/types/result.h"
 #include "pipeline/types/silhouette.h"
@@ -33,23 +34,34 @@ struct Segmentation {
   std::vector<std::string> warnings;  ///< what an operator should know, naming the camera
 };
 
+/// What one camera saw of the empty booth, learned once for any number of captures.
+///
+/// @param background  1 … 256 frames of one camera, size and channel count; 8-bit grey or RGB (sRGB)
+/// @error no_background  there are none, too many, or one is not like that
+/// Cost: O(pixels × frames); serial.
+Result<EmptyView> learn_empty_view(std::span<const Frame> background);
+
 /// Separates the subject from the background that the same camera saw in the empty booth.
 ///
 /// A model of the empty booth with its noise; drift of light, gain and white balance found from what still looks
 /// like it; shadows told from things by keeping the background's chromaticity and by fading in; a minimum cut for
 /// what is ambiguous; then the share that the subject covers of each pixel along the outline, in linear light.
 ///
-/// @param background  one or more frames of the empty booth, same camera, size and channels as `body`
+/// @param empty       of the same camera, size and channels as `body`
 /// @param body        8-bit grey or RGB (sRGB), distorted pixels as captured; the subject may be cut by the border
 /// @return a coverage of the frame's size, in its pixels: 255 subject, 0 background, its 127.5 level the outline
-/// @error no_background     `background` is empty, or a frame of it is missing or of another size or channel count
+/// @error no_background     `empty` is of another size or channel count
 /// @error no_subject        nothing in the frame differs from the background
 /// @error invalid_argument  an option outside its range, or a body frame that is empty or neither grey nor RGB
 /// @error cancelled         asked to stop
-/// Cost: O(pixels × frames), about 20 bytes a pixel. One call is serial: run the cameras side by side.
+/// Cost: O(pixels), about 20 bytes a pixel. One call is serial: run the cameras side by side.
 /// Source: J. Sun et al., "Background Cut", ECCV 2006; T. Horprasert et al. 1999 for shadows; for the outline the
 /// compositing equation I = α F + (1 − α) B with B known, R. J. Qian, M. I. Sezan, "Video background replacement
 /// without a blue screen", ICIP 1999.
+Result<Segmentation> segment(const EmptyView& empty, const Frame& body, const SegmentationOptions& options,
+                             const Work& work = {});
+
+/// The same before a background that is not kept. @error as learn_empty_view and above
 Result<Segmentation> segment(std::span<const Frame> background, const Frame& body, const SegmentationOptions& options,
                              const Work& work = {});
 

@@ -3,7 +3,8 @@
 
     job.py BOOTH_RECONSTRUCT RECORDING [--runs 5] [--face MODE] [--threads N] [--trace FILE] [--markdown]
 
-Runs the program several times, each in a process of its own, and prints the run of median wall time: by stage the
+Runs the program several times, each in a process of its own, after a run that is not counted, in which it learns the
+empty booth for all (but with --cold), and prints the run of median wall time: by stage the
 processor time of all threads, the span from its first step's beginning to its last one's end, how busy the threads
 were within it, and the resident memory at most. The trace of that run is kept with --trace; ui.perfetto.dev opens it.
 """
@@ -98,6 +99,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--trace", type=pathlib.Path, help="keep the trace of the median run here")
     parser.add_argument("--steps", action="store_true", help="by step instead of by stage")
+    parser.add_argument("--cold", action="store_true", help="learn the empty booth in every run")
     parser.add_argument("--markdown", action="store_true")
     arguments = parser.parse_args()
 
@@ -106,6 +108,9 @@ def main() -> None:
         command += ["--config", arguments.config]
     command.append(arguments.recording)
     with tempfile.TemporaryDirectory() as folder:
+        if not arguments.cold:
+            command += ["--cache", os.path.join(folder, "cache")]
+            run_once(command, pathlib.Path(folder, "first.json"))
         runs = [run_once(command, pathlib.Path(folder, f"{i}.json")) for i in range(arguments.runs)]
         runs.sort(key=lambda run: run["wall"])
         median = runs[len(runs) // 2]

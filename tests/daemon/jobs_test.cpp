@@ -21,6 +21,16 @@ class Jobs : public TestBooth {
   bool avatars_are_clean() { return entries(options_.config.booth.avatars()).empty(); }
 };
 
+TEST_F(Jobs, WhatWasLearnedOfTheEmptyBoothIsPreparedBeforeTheFirst) {
+  start_with("good");
+  ASSERT_TRUE(wait_until([&] { return !reconstruct_.learned().empty(); }));
+  const std::string background = entries(options_.config.booth.backgrounds()).at(0);
+  EXPECT_EQ(reconstruct_.learned(), (options_.config.booth.backgrounds() / background).string() + " --learn --cache " +
+                                        options_.config.booth.cache().string());
+  EXPECT_EQ(reconstruct_.calls(), 0U);
+  EXPECT_TRUE(wait_job(quick_capture(), "done"));
+}
+
 TEST_F(Jobs, AFailureIsTold) {
   start_with("fail");
   Listener listener(options_.config.api.events, booth_.get());

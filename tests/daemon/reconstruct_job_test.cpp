@@ -95,6 +95,19 @@ TEST_F(ReconstructJob, PublishesACompleteAvatar) {
   EXPECT_EQ(stages, job_stages());
 }
 
+TEST_F(ReconstructJob, MakesTheSameAvatarOfABackgroundThatWasLearnedBefore) {
+  const fs::path avatar = folder_ / "out/avatar";
+  ASSERT_TRUE(run());
+  const std::string model = text_of(avatar / "avatar.glb");
+  const EmptyViewStore store(folder_ / "cache");
+  for (int time = 0; time < 2; ++time) {
+    const auto report =
+        reconstruct_recording(folder_ / "recording", avatar, coarse(), {}, {}, pool_.work(), {}, {}, &store);
+    ASSERT_TRUE(report.ok()) << report.error().message;
+    EXPECT_EQ(text_of(avatar / "avatar.glb"), model);
+  }
+}
+
 TEST_F(ReconstructJob, MakesTheAvatarWithoutAFaceScanThatIsTooPoor) {
   add_unlit_face_scan();
   const auto report = run();

@@ -59,6 +59,13 @@ class FakeReconstruct {
     for (std::string line; std::getline(file, line);) ++count;
     return count;
   }
+  /// The arguments with which it was last asked to learn a background, or none.
+  std::string learned() const {
+    std::ifstream file(folder_ / "learned");
+    std::string last;
+    for (std::string line; std::getline(file, line);) last = line;
+    return last;
+  }
 
  private:
   const fs::path folder_;

@@ -7,6 +7,7 @@
 #include <random>
 
 #include "pipeline/geometry/camera_model.h"
+#include "pipeline/segmentation/segmentation.h"
 
 namespace booth {
 namespace {
@@ -46,10 +47,12 @@ Frame picture(const Eigen::Vector3d& rotation_rad, double growth, uint32_t seed,
   return {.camera = "a", .pixels = std::make_shared<const Image>(std::move(image))};
 }
 
-const std::vector<Frame>& empty_booth() {
-  static const std::vector<Frame> frames{picture(Eigen::Vector3d::Zero(), 0, 1),
-                                         picture(Eigen::Vector3d::Zero(), 0, 2)};
-  return frames;
+const Image& empty_booth() {
+  static const Image mean = learn_empty_view(std::vector<Frame>{picture(Eigen::Vector3d::Zero(), 0, 1),
+                                                                picture(Eigen::Vector3d::Zero(), 0, 2)})
+                                .value()
+                                .mean;
+  return mean;
 }
 
 TEST(BackgroundRegistration, FindsATurnToAFewHundredthsOfAPixel) {
@@ -113,7 +116,7 @@ TEST(BackgroundRegistration, WhoStandsBeforeTheBackgroundHasNoSay) {
 TEST(BackgroundRegistration, ABlankWallTellsNothing) {
   Frame blank = picture(Eigen::Vector3d::Zero(), 0, 6);
   blank.pixels = std::make_shared<const Image>(lens().width, lens().height, 3, uint8_t{180});
-  const auto found = register_background(std::vector{blank}, blank, {}, lens());
+  const auto found = register_background(*blank.pixels, blank, {}, lens());
   ASSERT_TRUE(found);
   EXPECT_FALSE(found->moved);
   // Nor one of which everything is hidden.
@@ -126,7 +129,7 @@ TEST(BackgroundRegistration, ABlankWallTellsNothing) {
 
 TEST(BackgroundRegistration, RefusesPicturesThatDoNotBelongTogether) {
   const Frame frame = picture(Eigen::Vector3d::Zero(), 0, 7);
-  EXPECT_FALSE(register_background({}, frame, {}, lens()));
+  EXPECT_FALSE(register_background(Image(), frame, {}, lens()));
   Frame small = frame;
   small.pixels = std::make_shared<const Image>(100, 100, 3);
   EXPECT_FALSE(register_background(empty_booth(), small, {}, lens()));
@@ -139,7 +142,7 @@ TEST(BackgroundRegistration, RefusesPicturesThatDoNotBelongTogether) {
   for (const int size : {1, 2, 5, 9}) {
     tiny.width = tiny.height = size;
     small.pixels = std::make_shared<const Image>(size, size, 3);
-    const auto found = register_background(std::vector{small}, small, {}, tiny);
+    const auto found = register_background(*small.pixels, small, {}, tiny);
     ASSERT_TRUE(found) << size;
     EXPECT_FALSE(found->moved);
   }

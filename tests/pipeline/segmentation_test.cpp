@@ -317,7 +317,7 @@ TEST(Segmentation, TheBackgroundItselfHasNoSubject) {
 TEST(Segmentation, RefusesBackgroundsThatDoNotFit) {
   const Scene scene = figure_scene();
   const Frame body = scene.body();
-  EXPECT_EQ(segment({}, body, {}).error().code, ErrorCode::no_background);
+  EXPECT_EQ(segment(std::span<const Frame>(), body, {}).error().code, ErrorCode::no_background);
 
   std::vector<Frame> frames = scene.empty_booth();
   frames[1].pixels = nullptr;

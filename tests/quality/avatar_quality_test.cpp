@@ -35,7 +35,8 @@ Result<Reconstruction> reconstruct_with_defaults(const Recording& recording) {
   const Work work = pool.work();
   CaptureFrames capture;
   capture.rig = recording.rig;
-  capture.background = load_shot(recording, *recording.find(ShotRole::background), work).sets;
+  capture.background =
+      learn_empty_booth(load_shot(recording, *recording.find(ShotRole::background), work).sets, work).views;
   capture.body = load_shot(recording, *recording.find(ShotRole::body), work).sets.at(0);
   return reconstruct(std::move(capture), {}, {}, work);
 }

@@ -51,7 +51,7 @@ class CameraHealth : public testing::TestWithParam<const char*> {
   }
 
   BackgroundMotion check_background(size_t c, const Frame& frame, const Image& subject) const {
-    const auto motion = register_background(capture_.background[c], frame, subject, camera(c).intrinsics);
+    const auto motion = register_background(capture_.background[c].mean, frame, subject, camera(c).intrinsics);
     EXPECT_TRUE(motion.ok()) << motion.error().message;
     return motion.ok() ? *motion : BackgroundMotion{};
   }

@@ -37,7 +37,7 @@ CaptureFrames load_capture(const std::filesystem::path& folder, const Work& work
   };
   CaptureFrames capture;
   capture.rig = recording.rig;
-  capture.background = sets_of(ShotRole::background);
+  capture.background = learn_empty_booth(sets_of(ShotRole::background), work).views;
   capture.body = sets_of(ShotRole::body).at(0);
   capture.face = {recording.find(ShotRole::gray_code)->pattern.value(), sets_of(ShotRole::gray_code)};
   return capture;

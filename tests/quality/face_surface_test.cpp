@@ -106,7 +106,8 @@ class FaceSurface : public testing::TestWithParam<const char*> {
     const Work work = pool_.work();
     CaptureFrames capture;
     capture.rig = recording.rig;
-    capture.background = load_shot(recording, *recording.find(ShotRole::background), work).sets;
+    capture.background =
+        learn_empty_booth(load_shot(recording, *recording.find(ShotRole::background), work).sets, work).views;
     capture.body = load_shot(recording, *recording.find(ShotRole::body), work).sets.at(0);
     capture.face = std::move(face);
     ReconstructionOptions options;

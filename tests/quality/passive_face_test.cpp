@@ -71,7 +71,8 @@ class PassiveFace : public testing::Test {
     const Recording recording = read_recording(folder).value();
     CaptureFrames capture;
     capture.rig = recording.rig;
-    capture.background = load_shot(recording, *recording.find(ShotRole::background), work).sets;
+    capture.background =
+        learn_empty_booth(load_shot(recording, *recording.find(ShotRole::background), work).sets, work).views;
     capture.body = load_shot(recording, *recording.find(ShotRole::body), work).sets.at(0);
     std::erase_if(capture.body.frames, [&](const Frame& frame) {
       return std::find(without.begin(), without.end(), frame.camera) != without.end();

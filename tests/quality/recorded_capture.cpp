@@ -15,9 +15,11 @@ RecordedCapture load_capture(const std::filesystem::path& folder, const Work& wo
   capture.silhouettes.resize(capture.frames.size());
   work.parallel_for(capture.frames.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end; ++i) {
+      std::vector<Frame> background;
       for (const FrameSet& set : empty)
         for (const Frame& frame : set.frames)
-          if (frame.camera == capture.frames[i].camera) capture.background[i].push_back(frame);
+          if (frame.camera == capture.frames[i].camera) background.push_back(frame);
+      capture.background[i] = learn_empty_view(background).value();
       capture.silhouettes[i] = segment(capture.background[i], capture.frames[i], {}).value().silhouette;
     }
   });

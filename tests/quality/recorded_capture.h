@@ -3,6 +3,7 @@
 #include <filesystem>
 #include <vector>
 
+#include "pipeline/types/empty_view.h"
 #include "pipeline/types/frame.h"
 #include "pipeline/types/rig.h"
 #include "pipeline/types/silhouette.h"
@@ -13,9 +14,9 @@ namespace booth::quality {
 /// A recording's body shot with what segmentation makes of it.
 struct RecordedCapture {
   Rig rig;
-  std::vector<Frame> frames;                   ///< of the body shot
-  std::vector<std::vector<Frame>> background;  ///< of the empty booth, by frame
-  std::vector<Silhouette> silhouettes;         ///< by frame
+  std::vector<Frame> frames;            ///< of the body shot
+  std::vector<EmptyView> background;    ///< of the empty booth, by frame
+  std::vector<Silhouette> silhouettes;  ///< by frame
 };
 
 /// @pre the recording is whole and somebody is in it
