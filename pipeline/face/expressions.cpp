@@ -6,6 +6,8 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <map>
+#include <set>
 #include <unordered_map>
 
 namespace booth {
@@ -54,6 +56,59 @@ std::vector<Eigen::Matrix3f> gradients(const NeutralHead& neutral, const FittedH
   }
   return gradient;
 }
+
+/// What lies between the lids, their edges included, which a mesh of another spacing cannot have.
+class BetweenLids {
+ public:
+  explicit BetweenLids(const NeutralHead& neutral) {
+    std::vector<uint8_t> within = neutral.eyeball;
+    constexpr int edge = 3;  // rows of vertices: the lid's inside and its edge
+    for (int row = 0; row < edge; ++row) {
+      std::vector<uint8_t> wider = within;
+      for (const auto& t : neutral.mesh.triangles)
+        if (std::any_of(t.begin(), t.end(), [&](uint32_t v) { return within[v] != 0; }))
+          for (const uint32_t v : t) wider[v] = 1;
+      within = std::move(wider);
+    }
+    std::map<uint32_t, std::set<uint32_t>> next_to;
+    for (uint32_t v = 0; v < within.size(); ++v)
+      if (within[v] != 0) next_to[v];
+    for (const auto& t : neutral.mesh.triangles)
+      for (const uint32_t v : t)
+        if (const auto found = next_to.find(v); found != next_to.end()) found->second.insert(t.begin(), t.end());
+    for (auto& [v, others] : next_to) {
+      others.erase(v);
+      vertices_.push_back({v, {others.begin(), others.end()}});
+    }
+  }
+
+  /// Moves it with the lids, by how near it is to each: every vertex as its neighbours do in the mean. An expression in
+  /// which the lid's edge went farthest goes as far with what is next to it, so that eyes still close.
+  void follow(std::vector<Eigen::Vector3f>& offset) const {
+    const float farthest = largest(offset);
+    constexpr int rounds = 200;  // an eye is some fifteen vertices across
+    for (int round = 0; round < rounds; ++round)
+      for (const Vertex& vertex : vertices_) {
+        Eigen::Vector3f sum = Eigen::Vector3f::Zero();
+        for (const uint32_t other : vertex.next_to) sum += offset[other];
+        offset[vertex.index] = sum / static_cast<float>(vertex.next_to.size());
+      }
+    if (const float left = largest(offset); left > 0)
+      for (Eigen::Vector3f& o : offset) o *= farthest / left;
+  }
+
+ private:
+  struct Vertex {
+    uint32_t index;
+    std::vector<uint32_t> next_to;
+  };
+  static float largest(const std::vector<Eigen::Vector3f>& offset) {
+    float most = 0;
+    for (const Eigen::Vector3f& o : offset) most = std::max(most, o.norm());
+    return most;
+  }
+  std::vector<Vertex> vertices_;
+};
 
 /// The point of a triangle nearest to p, as barycentric weights.
 /// Source: C. Ericson, "Real-time collision detection", 2005, 5.1.5.
@@ -156,11 +211,13 @@ std::vector<MorphTarget> carry_expressions(const NeutralHead& neutral, const Fit
   });
 
   const std::vector<Eigen::Matrix3f> gradient = gradients(neutral, head);
+  const BetweenLids between_lids(neutral);
   std::vector<MorphTarget> morphs;
   for (const Expression& expression : neutral.expressions) {
     std::vector<Eigen::Vector3f> offset(neutral.mesh.positions.size(), Eigen::Vector3f::Zero());
     for (size_t i = 0; i < expression.vertices.size(); ++i)
       offset[expression.vertices[i]] = gradient[expression.vertices[i]] * expression.offsets[i];
+    between_lids.follow(offset);
     MorphTarget morph{expression.name, {}, {}};
     for (uint32_t v = 0; v < places.size(); ++v) {
       const TriangleGrid::Place& place = places[v];

@@ -14,7 +14,8 @@ namespace booth {
 /// The neutral head's expressions on a subject's mesh. How the fit has turned and stretched the face around a vertex
 /// turns and stretches its offsets, so that a lid that has farther to go goes farther. A vertex of the mesh takes them
 /// from the place of the fitted face nearest to it that faces the same way; they fade out where the mesh leaves the
-/// fitted face, at the face's rim, and around what covers the face.
+/// fitted face, at the face's rim, and around what covers the face. The avatar is one surface, with nothing behind its
+/// lids: what lies between them moves with them, by how near it is to each, so that a closing eye narrows.
 ///
 /// @param patch  of that head
 /// @param mesh   world frame, metres: the avatar's; it may have any vertices

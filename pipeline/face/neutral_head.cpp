@@ -204,6 +204,9 @@ void read_regions(const Json& json, NeutralHead* head) {
 
   head->face_front.assign(vertices, 0);
   for (const uint32_t v : file["face_front"].indices(vertices)) head->face_front[v] = 1;
+  head->eyeball.assign(vertices, 0);
+  for (const char* side : {"eyeball_left", "eyeball_right"})
+    for (const uint32_t v : file[side].indices(vertices)) head->eyeball[v] = 1;
   const Node loop = file["face_front_loop"];
   head->face_front_loop = loop.indices(vertices);
   std::set<std::pair<uint32_t, uint32_t>> edges;

@@ -41,6 +41,7 @@ struct NeutralHead {
   std::vector<HeadPart> part;                          ///< per vertex
   std::vector<uint8_t> face_front;                     ///< per vertex: 1 from hairline to chin and before the ears
   std::vector<uint32_t> face_front_loop;               ///< its border in order
+  std::vector<uint8_t> eyeball;                        ///< per vertex: 1 between the lids
   std::vector<Expression> expressions;
 
   /// A landmark's place when the vertices are at `positions`.

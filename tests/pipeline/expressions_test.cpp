@@ -40,7 +40,7 @@ TEST_F(Expressions, ComeBackOnTheHeadItself) {
   const auto morphs = carry_expressions(*neutral_, same, face_patch(same), same.mesh);
   ASSERT_EQ(morphs.size(), neutral_->expressions.size());
   ASSERT_TRUE(check(morphs, same.mesh.positions.size()).ok());
-  for (const char* name : {"eyeBlinkLeft", "mouthSmileRight", "browInnerUp"}) {
+  for (const char* name : {"mouthFrownLeft", "mouthSmileRight", "browInnerUp"}) {
     const Expression& given = expression(name);
     const MorphTarget& carried = morph(morphs, name);
     for (size_t i = 0; i < given.vertices.size(); ++i) {
@@ -52,6 +52,38 @@ TEST_F(Expressions, ComeBackOnTheHeadItself) {
       EXPECT_LT((offset - given.offsets[i]).norm(), 1e-4F) << name << " " << given.vertices[i];
     }
   }
+}
+
+TEST_F(Expressions, NarrowWhatIsBetweenClosingLids) {
+  const FittedHead same = head(Eigen::Matrix3f::Identity());
+  const auto morphs = carry_expressions(*neutral_, same, face_patch(same), same.mesh);
+  float middle = 0, eyes = 0;
+  for (size_t v = 0; v < neutral_->eyeball.size(); ++v)
+    if (neutral_->eyeball[v] != 0 && neutral_->mesh.positions[v].x() > 0) {
+      middle += neutral_->mesh.positions[v].x();
+      ++eyes;
+    }
+  middle /= eyes;
+  const auto eye_height = [&](const std::vector<Eigen::Vector3f>& positions) {
+    float low = 1e9F, high = -1e9F;
+    for (size_t v = 0; v < positions.size(); ++v)
+      if (neutral_->eyeball[v] != 0 && std::abs(neutral_->mesh.positions[v].x() - middle) < 0.003F) {
+        low = std::min(low, positions[v].y());
+        high = std::max(high, positions[v].y());
+      }
+    return high - low;
+  };
+  const MorphTarget& blink = morph(morphs, "eyeBlinkLeft");
+  std::vector<Eigen::Vector3f> closed = same.mesh.positions;
+  float most = 0, given_most = 0;
+  for (size_t i = 0; i < blink.vertices.size(); ++i) {
+    closed[blink.vertices[i]] += blink.offsets[i];
+    most = std::max(most, blink.offsets[i].norm());
+  }
+  for (const Eigen::Vector3f& offset : expression("eyeBlinkLeft").offsets)
+    given_most = std::max(given_most, offset.norm());
+  EXPECT_NEAR(most, given_most, 1e-4F);
+  EXPECT_LT(eye_height(closed), 0.75F * eye_height(same.mesh.positions));
 }
 
 TEST_F(Expressions, TurnAndStretchWithTheFace) {
