@@ -18,8 +18,8 @@ namespace booth {
 
 /// How the photographs become one texture.
 enum class TextureMethod {
-  /// Each triangle from its best camera, as it is: what blending is compared with. Nothing evens out the cameras' gains,
-  /// for showing what they do is what it is for.
+  /// Each triangle from its best camera, as it is: what blending is compared with. Nothing evens out the cameras'
+  /// gains, for showing what they do is what it is for.
   best_view,
   /// The method of Pagés et al. 2015: the mean of all cameras that see a texel, weighted by their ratings, from inputs
   /// that were eroded and in-painted by Telea's method.
