@@ -23,13 +23,15 @@ def run_once(command: list[str], trace: pathlib.Path) -> dict:
     """One job. Returns its wall and processor seconds, its peak memory in MiB, and its trace."""
     with tempfile.TemporaryDirectory() as folder:
         started = time.monotonic()
-        child = subprocess.Popen(
-            [*command, os.path.join(folder, "avatar"), "--trace", str(trace)], stdout=subprocess.DEVNULL
-        )
-        _, status, usage = os.wait4(child.pid, 0)
-        wall = time.monotonic() - started
-    if status != 0:
-        sys.exit(f"{command[0]} failed")
+        with open(os.path.join(folder, "words"), "w+", encoding="utf-8") as words:
+            child = subprocess.Popen(
+                [*command, os.path.join(folder, "avatar"), "--trace", str(trace)], stdout=subprocess.DEVNULL, stderr=words
+            )
+            _, status, usage = os.wait4(child.pid, 0)
+            wall = time.monotonic() - started
+            words.seek(0)
+            if status != 0:
+                sys.exit(words.read())
     return {
         "wall": wall,
         "processor": usage.ru_utime + usage.ru_stime,
