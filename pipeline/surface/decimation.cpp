@@ -8,6 +8,7 @@
 #include <limits>
 #include <numeric>
 #include <span>
+#include <utility>
 #include <vector>
 
 namespace booth {
@@ -111,17 +112,16 @@ class EdgeQueue {
   }
   /// The entry of least cost, and its bucket; false when there is none.
   bool pop(Entry& entry, size_t& bucket) {
-    for (; lowest_ < buckets_.size(); ++lowest_) {
-      Bucket& candidate = buckets_[lowest_];
-      if (candidate.taken == candidate.entries.size()) {
-        candidate = {};
-        continue;
-      }
-      entry = candidate.entries[candidate.taken++];
-      bucket = lowest_;
-      return true;
-    }
-    return false;
+    bucket = lowest();
+    if (bucket == buckets_.size()) return false;
+    entry = buckets_[bucket].entries[buckets_[bucket].taken++];
+    return true;
+  }
+  /// The bucket of the entry of least cost; buckets() when there is none.
+  size_t lowest() {
+    while (lowest_ < buckets_.size() && buckets_[lowest_].taken == buckets_[lowest_].entries.size())
+      buckets_[lowest_++] = {};
+    return lowest_;
   }
   size_t buckets() const { return buckets_.size(); }
 
@@ -153,18 +153,21 @@ class Decimation {
     sum_quadrics();
   }
 
+  /// In so many parts a mesh is thinned side by side, however many threads there are.
+  static constexpr size_t slabs = 8;
   using Budget = std::array<size_t, 2>;  ///< of the triangles outside and inside the detail
 
   /// @param detail_share  of the budget; what the detail cannot use goes to the rest
   Mesh run(size_t total, double detail_share) {
     const size_t share = std::min(alive_[1], static_cast<size_t>(detail_share * static_cast<double>(total)));
     const Budget budget{total - share, share};
+    guard_ = careful;
+    thin(budget);
     // Where every collapse left is refused, what is asked of the triangles around it is lowered.
-    for (const Guard& guard : {Guard{0.3F, 0.02F}, Guard{-0.3F, 0.002F}, Guard{-1, 1e-5F}}) {
+    for (const Guard& guard : {careful, Guard{-0.3F, 0.002F}, Guard{-1, 1e-5F}}) {
       guard_ = guard;
       while (alive_[0] > budget[0] || alive_[1] > budget[1]) {
         const Budget before = alive_;
-        queue_all();
         collapse_until(budget);
         if (work_.stopped() || alive_ == before) break;
       }
@@ -178,6 +181,21 @@ class Decimation {
     float least_cosine;  ///< between a triangle's normals before and after
     float thinnest;      ///< twice the area over the longest side squared: 0.87 for equal sides, 0 for a needle
   };
+  struct Spanned {
+    Eigen::Vector3f normal;  ///< twice the area long
+    Eigen::Vector3f p, r;    ///< the two corners that stay, counter-clockwise
+  };
+  static constexpr Guard careful{0.3F, 0.02F};
+
+  /// Who collapses edges: their queue, and what a collapse needs to remember.
+  struct Collapser {
+    EdgeQueue queue;
+    const std::vector<uint8_t>* slab = nullptr;  ///< per vertex, see assign_slabs; null: may touch the whole mesh
+    Budget gone{0, 0};                           ///< triangles that its collapses took away
+    std::vector<uint32_t> ring, moved;
+    std::vector<Spanned> fan;
+  };
+
   // Collapses jump about in memory: what one needs of a vertex or a triangle is together, within a cache line.
   struct alignas(64) Vertex {
     Eigen::Vector3f position;
@@ -189,10 +207,6 @@ class Decimation {
     std::array<uint32_t, 3> twin{none, none, none};  ///< of its half-edges
     std::array<uint16_t, 3> stamp{};  ///< of its half-edges: entries of the queue with another are out of date
     uint8_t region = 0;               ///< which budget it counts against
-  };
-  struct Spanned {
-    Eigen::Vector3f normal;  ///< twice the area long
-    Eigen::Vector3f p, r;    ///< the two corners that stay, counter-clockwise
   };
 
   uint32_t from(uint32_t half) const { return triangles_[half / 3].corner[half % 3]; }
@@ -278,30 +292,110 @@ class Decimation {
     return q;
   }
 
-  void queue(uint32_t half) {
-    const uint32_t other = twin(half);
-    if (other == none || vertices_[from(half)].locked || vertices_[to(half)].locked) return;
+  void queue(uint32_t half, Collapser& by) {
+    const uint32_t other = twin(half), u = from(half), v = to(half);
+    if (other == none || vertices_[u].locked || vertices_[v].locked) return;
+    if (by.slab != nullptr && ((*by.slab)[u] == slabs || (*by.slab)[v] == slabs)) return;
     ++triangles_[other / 3].stamp[other % 3];
     const uint16_t stamp = ++triangles_[half / 3].stamp[half % 3];
     const Quadric q = edge_quadric(half);
-    queue_.push(EdgeQueue::bucket_of(q.at(-Inverse(q).times(q.b))), {half, stamp});
+    by.queue.push(EdgeQueue::bucket_of(q.at(-Inverse(q).times(q.b))), {half, stamp});
   }
 
-  void queue_all() {
-    queue_ = {};
+  /// One of the slabs for each vertex, of about as many vertices along the longest side of the mesh; for one that has a
+  /// neighbour in another, and may not be moved while these are at work, `slabs`.
+  std::vector<uint8_t> assign_slabs() const {
+    Eigen::AlignedBox3f box;
+    for (const Vertex& vertex : vertices_) box.extend(vertex.position);
+    Eigen::Index axis = 0;
+    box.sizes().maxCoeff(&axis);
+    std::vector<float> places;
+    for (const Vertex& vertex : vertices_) places.push_back(vertex.position[axis]);
+    std::array<float, slabs - 1> cuts{};
+    for (size_t n = 0; n < cuts.size(); ++n) {
+      const auto cut = places.begin() + static_cast<std::ptrdiff_t>((n + 1) * places.size() / slabs);
+      std::nth_element(places.begin(), cut, places.end());
+      cuts[n] = *cut;
+    }
+    std::vector<uint8_t> own, slab;
+    for (const Vertex& vertex : vertices_)
+      own.push_back(
+          static_cast<uint8_t>(std::upper_bound(cuts.begin(), cuts.end(), vertex.position[axis]) - cuts.begin()));
+    slab = own;
+    for (const Triangle& triangle : triangles_) {
+      const auto& [a, b, c] = triangle.corner;
+      if (own[a] != own[b] || own[b] != own[c]) slab[a] = slab[b] = slab[c] = slabs;
+    }
+    return slab;
+  }
+
+  /// Takes away what costs least, in parallel: the slabs are thinned side by side, each where it touches nothing of
+  /// another, all up to one cost, which is raised until so many triangles are left that the order among the last ones,
+  /// and the seams between the slabs, are decided in the whole mesh.
+  void thin(const Budget& budget) {
+    constexpr size_t left_over_percent = 160;  // of the budget, besides the seams
+    if (triangles_.size() * 100 < (budget[0] + budget[1]) * left_over_percent) return;
+    const std::vector<uint8_t> slab = assign_slabs();
+    Budget enough{budget[0] * left_over_percent / 100, budget[1] * left_over_percent / 100};
+    for (const Triangle& triangle : triangles_)
+      if (std::any_of(triangle.corner.begin(), triangle.corner.end(), [&](uint32_t v) { return slab[v] == slabs; }))
+        ++enough[triangle.region];
+    const auto spare = [&](size_t region) { return alive_[region] - std::min(alive_[region], enough[region]); };
+    std::vector<Collapser> collapsers(slabs);
+    std::array<std::vector<uint32_t>, slabs> edges;
     for (uint32_t half = 0; half < triangles_.size() * 3; ++half)
-      if (!dead(half) && half < twin(half)) queue(half);
+      if (const uint8_t own = slab[from(half)]; own != slabs && half < twin(half)) edges[own].push_back(half);
+    work_.parallel_for(slabs, 1, [&](size_t begin, size_t end) {
+      for (size_t n = begin; n < end; ++n) {
+        collapsers[n].slab = &slab;
+        for (const uint32_t half : edges[n]) queue(half, collapsers[n]);
+      }
+    });
+    constexpr size_t stride = EdgeQueue::fourfold / 4;
+    const size_t buckets = collapsers[0].queue.buckets();
+    size_t bound = buckets;
+    for (Collapser& collapser : collapsers) bound = std::min(bound, collapser.queue.lowest());
+    while (bound < buckets && !work_.stopped()) {
+      // So much each slab may take away, lest all together take too much where much costs the same.
+      const Budget most{spare(0) / slabs, spare(1) / slabs};
+      if (most[0] + most[1] == 0) return;
+      bound += stride;
+      work_.parallel_for(slabs, 1, [&](size_t begin, size_t end) {
+        for (size_t n = begin; n < end; ++n) {
+          Collapser& by = collapsers[n];
+          const auto wanted = [&](uint32_t half) {
+            const uint8_t region = triangles_[half / 3].region;
+            return by.gone[region] < most[region];
+          };
+          collapse_while([&] { return by.queue.lowest() < bound; }, wanted, by);
+        }
+      });
+      for (Collapser& collapser : collapsers) count_gone(collapser);
+    }
+  }
+
+  void count_gone(Collapser& by) {
+    for (size_t region = 0; region < alive_.size(); ++region) alive_[region] -= std::exchange(by.gone[region], 0);
   }
 
   void collapse_until(const Budget& budget) {
-    const auto wanted = [&](uint32_t half) {
-      const uint8_t region = triangles_[half / 3].region;
-      return alive_[region] > budget[region];
-    };
+    Collapser all;
+    for (uint32_t half = 0; half < triangles_.size() * 3; ++half)
+      if (!dead(half) && half < twin(half)) queue(half, all);
+    const auto is_over = [&](size_t region) { return alive_[region] - all.gone[region] > budget[region]; };
+    collapse_while([&] { return is_over(0) || is_over(1); },
+                   [&](uint32_t half) { return is_over(triangles_[half / 3].region); }, all);
+    count_gone(all);
+  }
+
+  /// Collapses the edges of the queue, the cheapest first, while there is one and `goes_on()`.
+  /// @param wanted  by half-edge: whether its triangle may go
+  template <class GoesOn, class Wanted>
+  void collapse_while(const GoesOn& goes_on, const Wanted& wanted, Collapser& by) {
     EdgeQueue::Entry entry{};
     size_t bucket = 0;
     constexpr size_t between_looks = 4096;  // edges between two looks at the stop token
-    for (size_t pops = 0; (alive_[0] > budget[0] || alive_[1] > budget[1]) && queue_.pop(entry, bucket); ++pops) {
+    for (size_t pops = 0; goes_on() && by.queue.pop(entry, bucket); ++pops) {
       if (pops % between_looks == 0 && work_.stopped()) return;
       const uint32_t half = entry.half;
       if (dead(half) || triangles_[half / 3].stamp[half % 3] != entry.stamp) continue;
@@ -311,29 +405,29 @@ class Decimation {
       const Inverse inverse(q);
       Eigen::Vector3f offset = -inverse.times(q.b);
       if (const size_t now = EdgeQueue::bucket_of(q.at(offset)); now > bucket) {
-        queue_.push(now, entry);
+        by.queue.push(now, entry);
         continue;
       }
-      if (may_collapse(half, inverse, offset))
-        collapse(half, offset);
-      else if (bucket + EdgeQueue::fourfold < queue_.buckets())
-        queue_.push(bucket + EdgeQueue::fourfold, entry);  // tried again when the mesh around it has changed
+      if (may_collapse(half, inverse, offset, by))
+        collapse(half, offset, by);
+      else if (bucket + EdgeQueue::fourfold < by.queue.buckets())
+        by.queue.push(bucket + EdgeQueue::fourfold, entry);  // tried again when the mesh around it has changed
     }
   }
 
   /// Moves the new vertex (its offset from the edge's start) to where it keeps the volume, and says whether the surface
   /// stays a manifold there and does not fold.
-  bool may_collapse(uint32_t half, const Inverse& inverse, Eigen::Vector3f& offset) {
+  bool may_collapse(uint32_t half, const Inverse& inverse, Eigen::Vector3f& offset, Collapser& by) const {
     const uint32_t u = from(half), v = to(half), back = twin(half);
     // Link condition (Dey et al.): the ends share no neighbour but the two that lie opposite the edge.
-    ring_.clear();
-    for_each_spoke(half, [&](uint32_t spoke) { ring_.push_back(to(spoke)); });
-    const size_t degree_u = ring_.size();
+    by.ring.clear();
+    for_each_spoke(half, [&](uint32_t spoke) { by.ring.push_back(to(spoke)); });
+    const size_t degree_u = by.ring.size();
     size_t degree_v = 0;
     std::ptrdiff_t shared = 0;
     for_each_spoke(back, [&](uint32_t spoke) {
       ++degree_v;
-      shared += std::count(ring_.begin(), ring_.end(), to(spoke));
+      shared += std::count(by.ring.begin(), by.ring.end(), to(spoke));
     });
     if (shared != 2 || (degree_u == 3 && degree_v == 3)) return false;
 
@@ -341,14 +435,14 @@ class Decimation {
     // All points count from u, where the triangles of u have no volume of their own.
     const Eigen::Vector3f& origin = at(u);
     const Eigen::Vector3f way = at(v) - origin;
-    fan_.clear();
+    by.fan.clear();
     Eigen::Vector3f gradient = Eigen::Vector3f::Zero();
     float volume = 0;
     for_each_spoke(half, [&](uint32_t spoke) {
       const Eigen::Vector3f p = at(to(spoke)) - origin, r = at(from(previous(spoke))) - origin;
       const Eigen::Vector3f normal = p.cross(r);
       gradient += normal;
-      if (spoke != half && spoke / 3 != back / 3) fan_.push_back({normal, p, r});
+      if (spoke != half && spoke / 3 != back / 3) by.fan.push_back({normal, p, r});
     });
     for_each_spoke(back, [&](uint32_t spoke) {
       if (spoke == back || spoke / 3 == half / 3) return;
@@ -356,14 +450,14 @@ class Decimation {
       const Eigen::Vector3f normal = (p - way).cross(r - way);
       gradient += normal;
       volume += normal.dot(way);
-      fan_.push_back({normal, p, r});
+      by.fan.push_back({normal, p, r});
     });
     const Eigen::Vector3f steepest = inverse.times(gradient);
     const float per_step = gradient.dot(steepest);
     const Eigen::Vector3f correction = steepest * ((volume - gradient.dot(offset)) / per_step);
     if (per_step > 0 && correction.squaredNorm() < way.squaredNorm()) offset += correction;
 
-    for (const auto& [normal, p, r] : fan_) {
+    for (const auto& [normal, p, r] : by.fan) {
       const Eigen::Vector3f to_p = p - offset, to_r = r - offset;
       const Eigen::Vector3f turned = to_p.cross(to_r);
       const float area = turned.norm();
@@ -375,11 +469,11 @@ class Decimation {
   }
 
   /// Moves the edge's start by `offset`, gives it all triangles of the end, and drops the edge's own two.
-  void collapse(uint32_t half, const Eigen::Vector3f& offset) {
+  void collapse(uint32_t half, const Eigen::Vector3f& offset, Collapser& by) {
     const uint32_t u = from(half), v = to(half), back = twin(half);
-    moved_.clear();
-    for_each_spoke(back, [&](uint32_t spoke) { moved_.push_back(spoke); });
-    for (const uint32_t spoke : moved_) triangles_[spoke / 3].corner[spoke % 3] = u;
+    by.moved.clear();
+    for_each_spoke(back, [&](uint32_t spoke) { by.moved.push_back(spoke); });
+    for (const uint32_t spoke : by.moved) triangles_[spoke / 3].corner[spoke % 3] = u;
     std::array<uint32_t, 2> joined{};  // of the two edges that become one, on each side
     size_t count = 0;
     for (const uint32_t edge : {half, back}) {
@@ -387,7 +481,7 @@ class Decimation {
       triangles_[a / 3].twin[a % 3] = b;
       triangles_[b / 3].twin[b % 3] = a;
       triangles_[edge / 3].corner = {none, none, none};
-      --alive_[triangles_[edge / 3].region];
+      ++by.gone[triangles_[edge / 3].region];
       joined[count++] = a;
     }
     Quadric q = vertices_[v].quadric;
@@ -396,7 +490,7 @@ class Decimation {
     q.move_origin(offset);
     vertices_[u].quadric = q;
     vertices_[u].position += offset;
-    for (const uint32_t edge : joined) queue(edge);
+    for (const uint32_t edge : joined) queue(edge, by);
   }
 
   Mesh compact() const {
@@ -419,11 +513,8 @@ class Decimation {
   const Work& work_;
   std::vector<Triangle> triangles_;
   std::vector<Vertex> vertices_;
-  EdgeQueue queue_;
   Budget alive_{0, 0};
   Guard guard_{};
-  std::vector<uint32_t> ring_, moved_;
-  std::vector<Spanned> fan_;
 };
 
 }  // namespace
