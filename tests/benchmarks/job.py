@@ -40,6 +40,23 @@ def run_once(command: list[str], trace: pathlib.Path) -> dict:
     }
 
 
+def run_at_once(command: list[str], jobs: int) -> None:
+    """So many jobs side by side, as boothd runs them with jobs.workers; prints how busy the processors were."""
+    with tempfile.TemporaryDirectory() as folder:
+        started = time.monotonic()
+        children = [
+            subprocess.Popen([*command, os.path.join(folder, str(i))], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            for i in range(jobs)
+        ]
+        ends = [os.wait4(child.pid, 0) for child in children]
+        wall = time.monotonic() - started
+    if any(status != 0 for _, status, _ in ends):
+        sys.exit(f"{command[0]} failed")
+    processor = sum(usage.ru_utime + usage.ru_stime for _, _, usage in ends)
+    share = processor / (wall * len(os.sched_getaffinity(0)))
+    print(f"{jobs} jobs at once: {wall:.2f} s, {processor:.2f} s of processor time, processors busy for {share:.0%} of it")
+
+
 def own_processor_time(events: list[dict]) -> list[tuple[dict, float]]:
     """Each event with its thread's processor time in seconds, that of the events inside it taken off."""
     own = []
@@ -102,6 +119,7 @@ def main() -> None:
     parser.add_argument("--trace", type=pathlib.Path, help="keep the trace of the median run here")
     parser.add_argument("--steps", action="store_true", help="by step instead of by stage")
     parser.add_argument("--cold", action="store_true", help="learn the empty booth in every run")
+    parser.add_argument("--at-once", type=int, default=0, help="run so many jobs side by side besides")
     parser.add_argument("--markdown", action="store_true")
     arguments = parser.parse_args()
 
@@ -114,6 +132,8 @@ def main() -> None:
             command += ["--cache", os.path.join(folder, "cache")]
             run_once(command, pathlib.Path(folder, "first.json"))
         runs = [run_once(command, pathlib.Path(folder, f"{i}.json")) for i in range(arguments.runs)]
+        if arguments.at_once:
+            run_at_once(command, arguments.at_once)
         runs.sort(key=lambda run: run["wall"])
         median = runs[len(runs) // 2]
         if arguments.trace:
