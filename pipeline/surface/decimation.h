@@ -13,7 +13,9 @@ struct DecimationOptions {
   size_t triangles = 20000;  ///< the budget; reached from above where topology allows
 };
 
-/// Fewer triangles by collapsing edges in the order of the quadric error, closed and manifold as the input.
+/// Fewer triangles by collapsing edges in the order of the quadric error, closed and manifold as the input. Of a large
+/// mesh slabs are thinned side by side, up to one error at a time, before the order among the last ones is decided in
+/// the whole: the same result for any number of threads.
 /// Source: M. Garland, P. Heckbert, "Surface simplification using quadric error metrics", SIGGRAPH 1997;
 /// link condition: T. Dey et al., "Topology preserving edge contraction", 1999.
 Mesh decimate(const Mesh& mesh, const DecimationOptions& options, const Work& work = {});

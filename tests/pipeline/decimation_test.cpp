@@ -3,6 +3,7 @@
 #include <gtest/gtest.h>
 
 #include <random>
+#include <stop_token>
 
 #include "pipeline/surface/marching_cubes.h"
 #include "pipeline/thread_pool.h"
@@ -40,6 +41,15 @@ TEST(Decimation, ReachesTheBudgetAndStaysClosed) {
     EXPECT_NEAR(after.signed_volume_m3, before.signed_volume_m3, 0.015 * before.signed_volume_m3) << budget;
     EXPECT_GT(smallest_area_m2(fewer), 1e-10) << budget;
   }
+}
+
+TEST(Decimation, StopsInTheMidstOfThinning) {
+  std::stop_source source;
+  source.request_stop();
+  const Mesh mesh = person_mesh(0.008);
+  const Mesh left = decimate(mesh, {.triangles = 3000}, {.stop = source.get_token(), .progress = {}, .parallel = {}});
+  EXPECT_TRUE(check(left).ok());
+  EXPECT_TRUE(topology(left).closed_manifold());
 }
 
 TEST(Decimation, StaysCloseToTheTrueSurface) {
@@ -129,11 +139,15 @@ TEST(Decimation, WhatIsNotAManifoldKeepsItsOddPlaces) {
 }
 
 TEST(Decimation, TheSameInputGivesTheSameBytes) {
-  const Mesh mesh = person_mesh(0.015);
-  ThreadPool pool(8);
-  const Mesh a = decimate(mesh, {.triangles = 3000}), b = decimate(mesh, {.triangles = 3000}, pool.work());
-  EXPECT_EQ(a.positions, b.positions);
-  EXPECT_EQ(a.triangles, b.triangles);
+  const Mesh mesh = person_mesh(0.008);  // large enough to be thinned in slabs
+  ASSERT_GT(mesh.triangles.size(), 20000U);
+  const Mesh alone = decimate(mesh, {.triangles = 3000});
+  for (const unsigned threads : {2U, 8U}) {
+    ThreadPool pool(threads);
+    const Mesh together = decimate(mesh, {.triangles = 3000}, pool.work());
+    EXPECT_EQ(together.positions, alone.positions) << threads;
+    EXPECT_EQ(together.triangles, alone.triangles) << threads;
+  }
 }
 
 }  // namespace
