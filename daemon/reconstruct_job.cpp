@@ -41,8 +41,7 @@ class StageClock {
     if (!progress_) return;
     double done = 0;
     for (const Stage& s : stages_) done += s.fraction * share_of(s.name);
-    const auto under_way = std::find_if(stages_.begin(), stages_.end(), [](const Stage& s) { return s.fraction < 1; });
-    progress_(under_way == stages_.end() ? stage : under_way->name, std::min(done / total_, 1.0));
+    progress_(stage, std::min(done / total_, 1.0));
   }
 
   /// The seconds of each stage that began, in the order of job_stages(); so far, where one is under way.

@@ -17,8 +17,8 @@ namespace booth {
 /// The stages of a job in their order: "load", those of reconstruct(), "export".
 const std::vector<std::string>& job_stages();
 
-/// Called with the stage under way, of several the one that began first, and the fraction of the whole job, 0 … 1,
-/// never falling; by one thread at a time.
+/// Called with a stage that is under way, several of which may overlap, and the fraction of the whole job, 0 … 1, never
+/// falling; by one thread at a time.
 using JobProgress = std::function<void(std::string_view stage, double fraction)>;
 
 struct JobReport {
