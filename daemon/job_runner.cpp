@@ -140,11 +140,12 @@ void JobRunner::learn(const std::stop_token& stop, Pulse& pulse) {
   if (!child) return spdlog::warn("the background is not prepared: {}", child.error().message);
   const auto deadline = SteadyClock::now() + options_.timeout;
   Tail output;
+  bool output_open = true;
   for (;;) {
     pulse.beat();
-    pollfd polled{child->output(), POLLIN, 0};
+    pollfd polled{output_open ? child->output() : -1, POLLIN, 0};
     ::poll(&polled, 1, static_cast<int>(step.count()));
-    output.read(child->output());
+    if (output_open) output_open = output.read(child->output());
     const auto status = child->poll_status();
     if (status && *status != 0) spdlog::warn("the background is not prepared: {}", output.last_line());
     if (status || stop.stop_requested() || SteadyClock::now() >= deadline) return;

@@ -64,7 +64,8 @@ class JobRunner {
   void conclude(const JobQueue::Lease& lease, const Run& run);
   void publish(const JobQueue::Lease& lease);
   void persist(const std::string& job);
-  /// Learns what prepare() named last, until there is a job to do.
+  /// Learns what prepare() named last, if that is still to be done. A job that comes meanwhile waits for it: it would
+  /// have to learn the same.
   void learn(const std::stop_token& stop, Pulse& pulse);
 
   const JobRunnerOptions options_;
