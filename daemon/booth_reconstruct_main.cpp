@@ -123,7 +123,7 @@ int learn(const Arguments& arguments) {
   }
   ThreadPool pool(arguments.threads);
   const EmptyViewStore kept(arguments.cache);
-  const LearnedBooth learned = learn_background(*recording, *background, &kept, pool.work());
+  const EmptyBooth learned = learn_background(*recording, *background, &kept, pool.work());
   for (const std::string& fault : learned.faults) std::cerr << "warning: " << fault << "\n";
   return 0;
 }

@@ -15,7 +15,6 @@
 #include <vector>
 
 #include "pipeline/export/sha256.h"
-#include "pipeline/reconstruct.h"
 
 namespace booth {
 namespace {
@@ -140,8 +139,8 @@ void EmptyViewStore::make_room() const {
   }
 }
 
-LearnedBooth learn_background(const Recording& recording, const Shot& background, const EmptyViewStore* store,
-                              const Work& work) {
+EmptyBooth learn_background(const Recording& recording, const Shot& background, const EmptyViewStore* store,
+                            const Work& work) {
   std::map<std::string, Shot> by_camera;
   for (const FrameRecord& frame : background.frames) {
     Shot& shot = by_camera[frame.camera];
@@ -149,11 +148,11 @@ LearnedBooth learn_background(const Recording& recording, const Shot& background
     shot.frames.push_back(frame);
   }
   const std::vector<std::pair<std::string, Shot>> cameras(by_camera.begin(), by_camera.end());
-  std::vector<LearnedBooth> learned(cameras.size());
+  std::vector<EmptyBooth> learned(cameras.size());
   work.parallel_for(cameras.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end && !work.stopped(); ++i) {
       const Shot& shot = cameras[i].second;
-      LearnedBooth& of_camera = learned[i];
+      EmptyBooth& of_camera = learned[i];
       if (auto kept = store != nullptr ? store->find(recording, shot.frames) : std::nullopt) {
         of_camera.views.push_back(std::move(*kept));
         continue;
@@ -169,8 +168,8 @@ LearnedBooth learn_background(const Recording& recording, const Shot& background
         of_camera.faults.push_back("the learned background is not kept: " + kept.error().message);
     }
   });
-  LearnedBooth all;
-  for (LearnedBooth& of_camera : learned) {
+  EmptyBooth all;
+  for (EmptyBooth& of_camera : learned) {
     for (EmptyView& view : of_camera.views) all.views.push_back(std::move(view));
     all.faults.insert(all.faults.end(), of_camera.faults.begin(), of_camera.faults.end());
   }

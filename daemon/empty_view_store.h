@@ -6,6 +6,7 @@
 #include <span>
 #include <string>
 
+#include "pipeline/reconstruct.h"
 #include "pipeline/types/empty_view.h"
 #include "pipeline/types/result.h"
 #include "pipeline/types/work.h"
@@ -35,16 +36,12 @@ class EmptyViewStore {
   uint64_t most_bytes_;
 };
 
-/// What was learned of the empty booth, from the store where it is there and otherwise from the frames, which are then
-/// kept in it. A frame that cannot be used is left out; the faults say which and why.
+/// What each camera saw of the empty booth, from the store where it is there and otherwise from the frames, which is
+/// then kept in it. A frame that cannot be used is left out; the faults say which and why.
 ///
-/// @param store  nullptr: nothing is kept
-/// @pre recording has a background shot
-struct LearnedBooth {
-  std::vector<EmptyView> views;
-  std::vector<std::string> faults;
-};
-LearnedBooth learn_background(const Recording& recording, const Shot& background, const EmptyViewStore* store,
-                              const Work& work = {});
+/// @param background  a shot of the recording
+/// @param store       nullptr: nothing is kept
+EmptyBooth learn_background(const Recording& recording, const Shot& background, const EmptyViewStore* store,
+                            const Work& work = {});
 
 }  // namespace booth

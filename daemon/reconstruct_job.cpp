@@ -99,7 +99,7 @@ Result<CaptureFrames> load_capture(const Recording& recording, FaceMode face, co
   capture.rig = recording.rig;
   if (const Shot* background = recording.find(ShotRole::background)) {
     const Step step(work, "load: empty booth");
-    LearnedBooth learned = learn_background(recording, *background, kept, work);
+    EmptyBooth learned = learn_background(recording, *background, kept, work);
     append(warnings, learned.faults);
     capture.background = std::move(learned.views);
   } else {

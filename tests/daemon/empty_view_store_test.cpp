@@ -22,7 +22,7 @@ class EmptyViewStoreTest : public testing::Test {
   ~EmptyViewStoreTest() override { fs::remove_all(folder_); }
 
   const Shot& background() const { return *recording_.find(ShotRole::background); }
-  LearnedBooth learn(const EmptyViewStore* store) const { return learn_background(recording_, background(), store); }
+  EmptyBooth learn(const EmptyViewStore* store) const { return learn_background(recording_, background(), store); }
   /// Overwrites the middle of each kept file, or cuts it off there.
   void damage(bool cut) const {
     for (const auto& file : fs::directory_iterator(cache_)) {
@@ -40,7 +40,7 @@ class EmptyViewStoreTest : public testing::Test {
   Recording recording_;
 };
 
-void expect_same(const LearnedBooth& a, const LearnedBooth& b) {
+void expect_same(const EmptyBooth& a, const EmptyBooth& b) {
   EXPECT_EQ(a.faults, b.faults);
   ASSERT_EQ(a.views.size(), b.views.size());
   for (size_t i = 0; i < a.views.size(); ++i) {
@@ -52,7 +52,7 @@ void expect_same(const LearnedBooth& a, const LearnedBooth& b) {
 }
 
 TEST_F(EmptyViewStoreTest, GivesBackWhatWasLearnedWithoutTheFrames) {
-  const LearnedBooth learned = learn(nullptr);
+  const EmptyBooth learned = learn(nullptr);
   ASSERT_EQ(learned.views.size(), 8U);
   EXPECT_FALSE(fs::exists(cache_));
   expect_same(learn(&store_), learned);
@@ -66,18 +66,18 @@ TEST_F(EmptyViewStoreTest, GivesBackWhatWasLearnedWithoutTheFrames) {
 }
 
 TEST_F(EmptyViewStoreTest, LearnsAnewWhatAnotherFileShows) {
-  const LearnedBooth learned = learn(&store_);
+  const EmptyBooth learned = learn(&store_);
   const fs::path frame = recording_.folder / background().frames[0].file;
   fs::copy_file(recording_.folder / background().frames[1].file, folder_ / "other.jpg");
   fs::rename(folder_ / "other.jpg", frame);
-  const LearnedBooth anew = learn(&store_);
+  const EmptyBooth anew = learn(&store_);
   ASSERT_EQ(anew.views.size(), learned.views.size());
   EXPECT_NE(anew.views[0].mean.samples, learned.views[0].mean.samples);
   EXPECT_EQ(anew.views[1].mean.samples, learned.views[1].mean.samples);
 }
 
 TEST_F(EmptyViewStoreTest, KnowsALinkToTheSameFile) {
-  const LearnedBooth learned = learn(&store_);
+  const EmptyBooth learned = learn(&store_);
   Recording linked = recording_;
   linked.folder = folder_ / "linked";
   for (const FrameRecord& frame : background().frames) {
@@ -88,7 +88,7 @@ TEST_F(EmptyViewStoreTest, KnowsALinkToTheSameFile) {
 }
 
 TEST_F(EmptyViewStoreTest, LearnsAnewWhatIsDamaged) {
-  const LearnedBooth learned = learn(&store_);
+  const EmptyBooth learned = learn(&store_);
   for (const bool cut : {false, true}) {
     damage(cut);
     EXPECT_FALSE(store_.find(recording_, std::vector{background().frames[0]}));
@@ -100,7 +100,7 @@ TEST_F(EmptyViewStoreTest, LearnsAnewWhatIsDamaged) {
 TEST_F(EmptyViewStoreTest, TellsAFaultEachTimeAndKeepsNothingOfThatCamera) {
   std::ofstream(recording_.folder / background().frames[0].file) << "no image";
   for (int time = 0; time < 2; ++time) {
-    const LearnedBooth learned = learn(&store_);
+    const EmptyBooth learned = learn(&store_);
     EXPECT_EQ(learned.views.size(), 7U);
     ASSERT_EQ(learned.faults.size(), 1U);
     EXPECT_NE(learned.faults[0].find(background().frames[0].file), std::string::npos);
@@ -109,7 +109,7 @@ TEST_F(EmptyViewStoreTest, TellsAFaultEachTimeAndKeepsNothingOfThatCamera) {
 
 TEST_F(EmptyViewStoreTest, SaysWhatCannotBeKeptAndGoesOn) {
   std::ofstream(cache_) << "a file where the folder should be";
-  const LearnedBooth learned = learn(&store_);
+  const EmptyBooth learned = learn(&store_);
   EXPECT_EQ(learned.views.size(), 8U);
   ASSERT_EQ(learned.faults.size(), 8U);
   EXPECT_NE(learned.faults[0].find(cache_.string()), std::string::npos);
