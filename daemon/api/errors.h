@@ -18,6 +18,9 @@ inline constexpr RpcError parse_error{-32700, "parse_error"};
 inline constexpr RpcError invalid_request{-32600, "invalid_request"};
 inline constexpr RpcError unknown_method{-32601, "unknown_method"};
 
+/// Of the interface: the client's role may not do that.
+inline constexpr RpcError forbidden{-32009, "forbidden"};
+
 /// Of the booth: the one table from error codes to the interface's codes and kinds.
 RpcError rpc_error(ErrorCode code);
 

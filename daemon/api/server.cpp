@@ -22,6 +22,7 @@
 #include "daemon/api/dispatcher.h"
 #include "daemon/api/errors.h"
 #include "daemon/api/event_codec.h"
+#include "daemon/api/json_rpc.h"
 #include "daemon/api/json_values.h"
 #include "daemon/api/key_store.h"
 #include "daemon/api/methods.h"
@@ -38,7 +39,6 @@ using Json = nlohmann::json;
 using SteadyClock = std::chrono::steady_clock;
 using Envelope = std::vector<zmq::message_t>;
 
-constexpr size_t most_request_bytes = 64 * 1024;
 /// A frame larger than that is not even received: its connection is closed. In between there is an answer.
 constexpr int64_t most_received_bytes = 128 * 1024;
 constexpr size_t most_envelope_frames = 16;
@@ -60,7 +60,6 @@ constexpr std::chrono::milliseconds ping_pause{5000};
 constexpr std::chrono::milliseconds longest_silence{15'000};
 constexpr std::chrono::milliseconds bind_again{50};  ///< until an endpoint that was closed is free again
 constexpr RateLimiter::Options request_rates{.per_second = 1000, .burst = 5000};
-constexpr RpcError forbidden{-32009, "forbidden"};
 
 constexpr const char* key_was_used = "key: it was used for another request before";
 
@@ -72,35 +71,13 @@ struct Completions {
 };
 
 /// A request that was carried out, or is being carried out elsewhere.
-struct Pending {
+struct Pending : Request {
   zmq::socket_t* socket = nullptr;  ///< that it came from
   Envelope envelope;
-  Json id;
-  bool notification = false;
-  const MethodEntry* method = nullptr;
-  std::optional<std::string> key;
-  Json params;  ///< of a request with a key
   SteadyClock::time_point received;
   std::optional<Reply> early;    ///< what is answered when it takes long
   std::vector<Pending> repeats;  ///< of the same request, which get the same answer
 };
-
-struct Refusal {
-  RpcError error;
-  std::string message;
-};
-
-std::string error_text(const Json& id, const RpcError& error, const std::string& message) {
-  return to_text({{"jsonrpc", "2.0"},
-                  {"id", id},
-                  {"error", {{"code", error.code}, {"message", message}, {"data", {{"kind", error.kind}}}}}});
-}
-
-std::string result_text(const Json& id, const Json& result) {
-  return to_text({{"jsonrpc", "2.0"}, {"id", id}, {"result", result}});
-}
-
-bool is_id(const Json& id) { return id.is_string() || id.is_number() || id.is_null(); }
 
 /// The file a client connects to, for ipc endpoints.
 std::optional<std::string> socket_file(const std::string& endpoint) {
@@ -209,7 +186,6 @@ struct Server::Content {
   void close_revoked();
   std::optional<Role> role_of(zmq::message_t& message, std::string& client) const;
   void accept(zmq::socket_t& control, Envelope envelope, std::string_view text, Role role);
-  std::optional<Refusal> read(const Json& message, Role role, Pending& request);
   void carry_out(Pending request);
   void complete(uint64_t number, const Answer& answer);
   void answer_early();
@@ -407,52 +383,11 @@ void Server::Content::accept(zmq::socket_t& control, Envelope envelope, std::str
   request.socket = &control;
   request.envelope = std::move(envelope);
   request.received = SteadyClock::now();
-  std::optional<Refusal> refusal;
-  if (text.size() > most_request_bytes) {
-    refusal =
-        Refusal{invalid_request, "the request has " + std::to_string(text.size()) + " bytes, expected at most 65536"};
-  } else {
-    const Json message = Json::parse(text, nullptr, false);
-    refusal = message.is_discarded() ? Refusal{parse_error, "the request is not JSON in UTF-8"}
-                                     : read(message, role, request);
-  }
+  const auto refusal = read_request(text, role, request);
   if (!refusal) return carry_out(std::move(request));
   booth.metrics().add("requests_failed");
   if (!request.notification)
     send(control, request.envelope, error_text(request.id, refusal->error, refusal->message), {});
-}
-
-/// Checks what every request has. The notification flag and the id are set where they can be told.
-std::optional<Refusal> Server::Content::read(const Json& message, Role role, Pending& request) {
-  if (message.is_array()) return Refusal{invalid_request, "batches are not offered: send one request per message"};
-  if (!message.is_object()) return Refusal{invalid_request, "a request is a JSON object"};
-  const auto id = message.find("id");
-  if (id != message.end()) {
-    if (!is_id(*id)) return Refusal{invalid_request, "id: expected a text or a number"};
-    request.id = *id;
-  }
-  const auto version = message.find("jsonrpc");
-  if (version == message.end() || *version != "2.0") return Refusal{invalid_request, "jsonrpc: expected \"2.0\""};
-  const auto method = message.find("method");
-  if (method == message.end() || !method->is_string()) return Refusal{invalid_request, "method: expected a text"};
-
-  request.notification = id == message.end();
-  request.method = find_method(method->get_ref<const std::string&>());
-  if (request.method == nullptr) return Refusal{unknown_method, "there is no method " + to_text(*method)};
-  if (!may(role, request.method->method))
-    return Refusal{forbidden, "a key of the role " + std::string(to_string(role)) + " may not call " +
-                                  std::string(request.method->name) + "; the role " +
-                                  std::string(to_string(least_role(request.method->method))) + " may"};
-  const RpcError invalid_params = rpc_error(ErrorCode::invalid_argument);
-  const auto params = message.find("params");
-  request.params = params == message.end() ? Json::object() : *params;
-  if (!request.params.is_object()) return Refusal{invalid_params, "params: expected an object"};
-  if (request.method->changes) {
-    auto key = take_key(request.params);
-    if (!key) return Refusal{invalid_params, key.error().message};
-    request.key = std::move(*key);
-  }
-  return std::nullopt;
 }
 
 void Server::Content::carry_out(Pending request) {
