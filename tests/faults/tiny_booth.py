@@ -126,11 +126,11 @@ class Refused(Exception):
 class Booth:
     """A boothd on a folder, which it keeps from start to start."""
 
-    def __init__(self, bin_dir, folder, recording=None, real=False):
+    def __init__(self, bin_dir, folder, recording=None, real=False, pace="fast"):
         self.bin_dir, self.folder = pathlib.Path(bin_dir), pathlib.Path(folder)
         self.state = self.folder / "state"
         self.control, self.events = f"ipc://{folder}/control", f"ipc://{folder}/events"
-        self.recording = recording
+        self.recording, self.pace = recording, pace
         if recording is None:
             self.recording = self.folder / "tiny"
             write_tiny_recording(self.recording)
@@ -156,7 +156,7 @@ class Booth:
         config.write_text(
             f'[booth]\nstate_directory = "{self.state}"\n[api]\ncontrol = "{self.control}"\nevents = "{self.events}"\n{self.api}'
             f'[capture]\nframe_timeout_ms = 1000\n[disk]\nreserve_mib = 0\n'
-            f'[replay]\nrecording = "{self.recording}"\npace = "fast"\n{self.settings}')
+            f'[replay]\nrecording = "{self.recording}"\npace = "{self.pace}"\n{self.settings}')
         command = [self.bin_dir / "boothd", "--config", config]
         if self.reconstruct:
             command += ["--reconstruct", self.reconstruct]
