@@ -7,10 +7,13 @@
 #include <cstdint>
 #include <vector>
 
+#include "pipeline/geometry/brick_bits.h"
+
 namespace booth {
 namespace {
 
 constexpr int side = Field::brick_side;
+constexpr int side_bits = std::countr_zero(static_cast<unsigned>(side));
 
 /// The 27 cells around one as bits: (dz + 1) · 9 + (dy + 1) · 3 + dx + 1.
 constexpr int middle_bit = 13;
@@ -70,276 +73,393 @@ bool is_simple(uint32_t solid) {
          count_parts(~solid & all_around, all_around, adjacency.by_corner) == 1;
 }
 
+/// is_simple with a memory: of the surroundings that fronts meet, a few make up nearly all.
+class SimpleCells {
+ public:
+  bool operator()(uint32_t solid) {
+    Known& known = known_[solid * 2654435761U >> (32 - memory_bits)];  // Knuth's multiplicative hash
+    if (known.solid != solid || !known.any) known = {solid, true, is_simple(solid)};
+    return known.simple;
+  }
+
+ private:
+  static constexpr int memory_bits = 12;
+  struct Known {
+    uint32_t solid = 0;
+    bool any = false, simple = false;
+  };
+  std::array<Known, size_t{1} << memory_bits> known_{};
+};
+
+/// A cube of samples, by the brick of its first sample and that sample's number in the brick.
+struct Cell {
+  uint32_t brick;
+  uint16_t sample;
+};
+
+/// Which samples of a field are inside, as bits. Bricks are numbered with one more on each side of the grid, where
+/// everything is outside, so that each has 26 around it.
+class Solid {
+ public:
+  Solid(const Field& field, const Work& work) : field_(field), bits_(field.blocks()) {
+    const auto count = [&](size_t axis) { return static_cast<uint32_t>(field.bricks()[axis] + 2); };
+    step_ = {1, count(0), count(0) * count(1)};
+    block_.assign(size_t{step_[2]} * count(2), Field::all_outside);
+    for_each_brick([&](uint32_t brick, size_t in_field) { block_[brick] = field.brick(in_field); });
+    constexpr size_t grain = 64;
+    work.parallel_for(bits_.size(), grain, [&](size_t begin, size_t end) {
+      for (size_t n = begin; n < end; ++n) bits_[n] = inside_bits(field.block(static_cast<int32_t>(n)));
+    });
+  }
+
+  /// From a brick to the next along x, y, z.
+  const std::array<uint32_t, 3>& step() const { return step_; }
+  size_t bricks() const { return block_.size(); }
+  int32_t block(size_t brick) const { return block_[brick]; }
+  const BrickBits& bits(size_t brick) const {
+    const int32_t block = block_[brick];
+    if (block >= 0) return bits_[static_cast<size_t>(block)];
+    return block == Field::all_inside ? all : none;
+  }
+  const Field& field() const { return field_; }
+
+  /// Calls `visit` with the number of each brick of the grid, here and in the field.
+  template <class Visitor>
+  void for_each_brick(const Visitor& visit) const {
+    const auto& bricks = field_.bricks();
+    for (int z = 0; z < bricks[2]; ++z)
+      for (int y = 0; y < bricks[1]; ++y)
+        for (int x = 0; x < bricks[0]; ++x)
+          visit(static_cast<uint32_t>(x + 1) * step_[0] + static_cast<uint32_t>(y + 1) * step_[1] +
+                    static_cast<uint32_t>(z + 1) * step_[2],
+                field_.brick_index(x, y, z));
+  }
+
+ private:
+  static constexpr BrickBits none{};
+  static constexpr BrickBits all = [] {
+    BrickBits bits{};
+    bits.fill(~uint64_t{0});
+    return bits;
+  }();
+
+  const Field& field_;
+  std::array<uint32_t, 3> step_{};
+  std::vector<int32_t> block_;   ///< by brick: as Field::brick
+  std::vector<BrickBits> bits_;  ///< by block
+};
+
+/// Of the cells of so many samples along their side those that wholly belong to `bits`, as bits of their first samples.
+template <int cell>
+BrickBits whole_cells(BrickBits bits) {
+  for (int step = 1; step < cell; step *= 2) {
+    for (uint64_t& plane : bits) {
+      plane &= plane >> step;
+      plane &= plane >> (step * side);
+    }
+    for (size_t k = 0; k + static_cast<size_t>(step) < bits.size(); ++k) bits[k] &= bits[k + static_cast<size_t>(step)];
+  }
+  uint64_t firsts = 0;
+  for (int n = 0; n < side * side; ++n)
+    if (n % side % cell == 0 && n / side % cell == 0) firsts |= uint64_t{1} << n;
+  for (size_t k = 0; k < bits.size(); ++k) bits[k] &= k % cell == 0 ? firsts : 0;
+  return bits;
+}
+
+/// Calls `visit` with the number of every sample whose bit is set, in their order.
+template <class Visitor>
+void for_each_sample(const BrickBits& bits, const Visitor& visit) {
+  for (size_t k = 0; k < bits.size(); ++k)
+    for (uint64_t plane = bits[k]; plane != 0; plane &= plane - 1)
+      visit(static_cast<uint16_t>(k * side * side + static_cast<size_t>(std::countr_zero(plane))));
+}
+
 /// Grows the inside or the outside of a field without a change of topology, by cells of 8, 4, 2 samples along their
 /// side and at last by samples, those farther from the surface first.
 class Growth {
  public:
-  Growth(const Field& field, bool inside, const Work& work) : field_(field), inside_(inside), work_(work) {
-    const auto bricks = field.bricks();
-    for (size_t axis = 0; axis < 3; ++axis) samples_[axis] = bricks[axis] * side;
-    const size_t count = field.bricks()[0] * static_cast<size_t>(bricks[1]) * static_cast<size_t>(bricks[2]);
-    whole_.assign(count, 0);
-    detail_of_.assign(count, -1);
+  Growth(const Solid& solid, bool inside, const Work& work)
+      : solid_(solid),
+        inside_(inside),
+        work_(work),
+        bricks_(solid.bricks(), inside ? uint8_t{0} : grown_bit),  // beyond the grid everything is outside
+        page_of_(solid.bricks(), inside ? empty_page : grown_page),
+        any_(!inside) {
+    solid.for_each_brick([&](uint32_t brick, size_t) {
+      bricks_[brick] = 0;
+      page_of_[brick] = empty_page;
+    });
+    pages_.reserve(solid.field().blocks() + 2);
+    pages_.emplace_back().fill(0);
+    pages_.emplace_back().fill(grown_bit);
+    for (size_t axis = 0; axis < 3; ++axis) brick_step_[axis] = solid.step()[axis];
   }
 
   /// The samples that should belong and were left out, in parts.
-  std::vector<std::vector<std::array<int, 3>>> run() {
-    for (int cell = side; cell >= 1 && !work_.stopped(); cell /= 2) grow(cell);
+  std::vector<std::vector<Cell>> run() {
+    grow<side>();
+    solid_.for_each_brick(
+        [&](uint32_t brick, size_t) { page_of_[brick] = (bricks_[brick] & grown_bit) != 0 ? grown_page : empty_page; });
+    grow<side / 2>();
+    grow<side / 4>();
+    grow<1>();
     return left_out();
   }
 
  private:
-  using Place = std::array<int, 3>;  // of a cell's first sample
   static constexpr size_t depths = 32;
-
-  size_t brick_of(const Place& p) const { return field_.brick_index(p[0] / side, p[1] / side, p[2] / side); }
-  static size_t sample_of(const Place& p) {
-    return static_cast<size_t>(((p[2] % side) * side + p[1] % side) * side + p[0] % side);
-  }
-  bool on_grid(const Place& p) const {
-    return p[0] >= 0 && p[1] >= 0 && p[2] >= 0 && p[0] < samples_[0] && p[1] < samples_[1] && p[2] < samples_[2];
-  }
-  /// Beyond the grid everything is outside.
-  bool grown(const Place& p) const {
-    if (!on_grid(p)) return !inside_;
-    const size_t brick = brick_of(p);
-    if (whole_[brick] != 0) return true;
-    const int32_t detail = detail_of_[brick];
-    return detail >= 0 && (details_[static_cast<size_t>(detail)][sample_of(p)] & grown_bit) != 0;
-  }
-  bool belongs(const Place& p) const {
-    const int32_t block = field_.brick(brick_of(p));
-    if (block < 0) return (block == Field::all_inside) == inside_;
-    return (field_.block(block)[sample_of(p)] < 0) == inside_;
-  }
-  bool belongs_all(const Place& p, int cell) const {
-    if (field_.brick(brick_of(p)) < 0) return belongs(p);
-    for (int k = 0; k < cell; ++k)
-      for (int j = 0; j < cell; ++j)
-        for (int i = 0; i < cell; ++i)
-          if (!belongs({p[0] + i, p[1] + j, p[2] + k})) return false;
-    return true;
-  }
-
   static constexpr uint8_t grown_bit = 1, waiting_bit = 2, refused_bit = 4;
-  uint8_t* state(const Place& p) {
-    const size_t brick = brick_of(p);
-    if (detail_of_[brick] < 0) {
-      detail_of_[brick] = static_cast<int32_t>(details_.size());
-      details_.emplace_back().fill(0);
+  static constexpr uint8_t belongs_bit = 8;  ///< the whole cell should belong, and has not been grown yet
+  /// Pages that many bricks share: nothing of them is grown and nothing can be, or all is.
+  static constexpr uint32_t empty_page = 0, grown_page = 1;
+
+  BrickBits belonging(uint32_t brick) const {
+    BrickBits bits = solid_.bits(brick);
+    if (!inside_)
+      for (uint64_t& plane : bits) plane = ~plane;
+    return bits;
+  }
+
+  uint8_t& state(const Cell& c) { return pages_[page_of_[c.brick]][c.sample]; }
+  void give_page(uint32_t brick) {
+    if (page_of_[brick] != empty_page) return;
+    page_of_[brick] = static_cast<uint32_t>(pages_.size());
+    pages_.emplace_back().fill(0);
+  }
+
+  /// Where the 27 cells around one lie.
+  template <int cell>
+  class Around {
+   public:
+    Around(const Growth& growth, const Cell& c)
+        : growth_(growth),
+          brick_(c.brick),
+          x_(c.sample % side),
+          y_(c.sample / side % side),
+          z_(c.sample / (side * side)) {}
+
+    Cell at(int dx, int dy, int dz) const {
+      const int x = x_ + dx * cell, y = y_ + dy * cell, z = z_ + dz * cell;
+      const auto& step = growth_.brick_step_;
+      // Shifted arithmetically, −1 lies in the brick before.
+      return {static_cast<uint32_t>(brick_ + (x >> side_bits) * step[0] + (y >> side_bits) * step[1] +
+                                    (z >> side_bits) * step[2]),
+              static_cast<uint16_t>(((z & (side - 1)) * side + (y & (side - 1))) * side + (x & (side - 1)))};
     }
-    return &details_[static_cast<size_t>(detail_of_[brick])][sample_of(p)];
+    /// Calls `visit` with the number of each and with the cell, the one in the middle included.
+    template <class Visitor>
+    void for_each(const Visitor& visit) const {
+      int n = 0;
+      for (int dz = -1; dz <= 1; ++dz)
+        for (int dy = -1; dy <= 1; ++dy)
+          for (int dx = -1; dx <= 1; ++dx, ++n) visit(n, at(dx, dy, dz));
+    }
+
+   private:
+    const Growth& growth_;
+    int64_t brick_;
+    int x_, y_, z_;
+  };
+
+  template <int cell>
+  uint8_t& state_of(const Cell& c) {
+    if constexpr (cell == side) return bricks_[c.brick];
+    return state(c);
   }
 
-  template <class Visitor>
-  static void for_each_around(const Place& p, int cell, const Visitor& visit) {
-    int bit = 0;
-    for (int dz = -cell; dz <= cell; dz += cell)
-      for (int dy = -cell; dy <= cell; dy += cell)
-        for (int dx = -cell; dx <= cell; dx += cell, ++bit)
-          if (bit != middle_bit) visit(bit, Place{p[0] + dx, p[1] + dy, p[2] + dz});
-  }
-
-  void grow(int cell) {
-    find_front(cell);
+  template <int cell>
+  void grow() {
+    if (work_.stopped()) return;
+    find_front<cell>();
     for (size_t depth = 0; depth < depths; ++depth) {
       // Cells that are deeper than those in turn may come up again.
       while (taken_[depth] < queue_[depth].size()) {
-        const Place p = queue_[depth][taken_[depth]++];
-        uint8_t& own = *state(p);
+        const Cell c = queue_[depth][taken_[depth]++];
+        std::array<Cell, 27> around;
+        uint32_t grown = 0, open = 0, refused = 0;
+        Around<cell>(*this, c).for_each([&](int n, const Cell& q) {
+          const uint8_t of = state_of<cell>(q);
+          around[static_cast<size_t>(n)] = q;
+          grown |= static_cast<uint32_t>(of & grown_bit) << n;
+          open |= static_cast<uint32_t>((of & (belongs_bit | waiting_bit)) == belongs_bit) << n;
+          refused |= static_cast<uint32_t>((of & refused_bit) != 0) << n;
+        });
+        uint8_t& own = state_of<cell>(c);
         own &= static_cast<uint8_t>(~waiting_bit);
-        if ((own & grown_bit) != 0) continue;
-        uint32_t around = 0;
-        for_each_around(p, cell, [&](int bit, const Place& q) { around |= static_cast<uint32_t>(grown(q)) << bit; });
-        if (!is_simple(inside_ ? around : ~around & all_around)) {
+        if (!simple_((inside_ ? grown : ~grown) & all_around)) {
           own |= refused_bit;
           continue;
         }
-        add(p, cell);
-        size_t first = depth;
-        for_each_around(p, cell, [&](int bit, const Place& q) {
-          const bool beside = (adjacency.faces >> bit & 1U) != 0;
-          if (on_grid(q) && !grown(q)) first = std::min(first, offer(q, cell, beside));
-        });
-        if (first < depth) {
-          depth = first;
-        }
+        add<cell>(c);
+        // New in the queue, or refused before something changed beside them.
+        uint32_t offered = open & (adjacency.faces | refused) & all_around;
+        for (; offered != 0; offered &= offered - 1)
+          depth = std::min(depth, offer<cell>(around[static_cast<size_t>(std::countr_zero(offered))]));
       }
     }
     for (size_t depth = 0; depth < depths; ++depth) {
       queue_[depth].clear();
       taken_[depth] = 0;
     }
-    for (auto& detail : details_)
-      for (uint8_t& value : detail) value &= grown_bit;
+    keep_grown();
   }
 
-  /// Puts a cell in the queue that is new there, or that was refused before something changed beside it.
-  size_t offer(const Place& p, int cell, bool is_new) {
-    if (field_.brick(brick_of(p)) >= 0 || cell < side) {
-      if (!belongs_all(p, cell)) return depths;
-    } else if (!belongs(p)) {
-      return depths;
-    }
-    uint8_t& own = *state(p);
-    if ((own & waiting_bit) != 0 || (!is_new && (own & refused_bit) == 0)) return depths;
+  template <int cell>
+  size_t offer(const Cell& c) {
+    uint8_t& own = state_of<cell>(c);
     own = static_cast<uint8_t>((own | waiting_bit) & ~refused_bit);
-    const size_t depth = depth_of(p, cell);
-    queue_[depth].push_back(p);
+    const size_t depth = cell == 1 ? depth_of(c) : 0;
+    queue_[depth].push_back(c);
     return depth;
   }
 
-  /// Rank of a cell: 0 for the deepest.
-  size_t depth_of(const Place& p, int cell) const {
-    const int32_t block = field_.brick(brick_of(p));
-    if (cell > 1 || block < 0) return 0;
-    const double share = std::abs(static_cast<double>(field_.block(block)[sample_of(p)])) / (2 * field_.grid().voxel_m);
+  /// Rank of a sample: 0 for the deepest.
+  size_t depth_of(const Cell& c) const {
+    const int32_t block = solid_.block(c.brick);
+    if (block < 0) return 0;
+    const Field& field = solid_.field();
+    const double share = std::abs(static_cast<double>(field.block(block)[c.sample])) / (2 * field.grid().voxel_m);
     return static_cast<size_t>((1 - std::min(share, 1.0)) * (depths - 1));
   }
 
-  void add(const Place& p, int cell) {
-    if (cell == side) {
-      whole_[brick_of(p)] = 1;
+  template <int cell>
+  void add(const Cell& c) {
+    any_ = true;
+    if constexpr (cell == side) {
+      bricks_[c.brick] = grown_bit;
       return;
     }
+    uint8_t* first = &state(c);
     for (int k = 0; k < cell; ++k)
-      for (int j = 0; j < cell; ++j)
-        for (int i = 0; i < cell; ++i) *state({p[0] + i, p[1] + j, p[2] + k}) |= grown_bit;
+      for (int j = 0; j < cell; ++j) std::fill_n(first + (k * side + j) * side, cell, grown_bit);
   }
 
-  /// The cells beside what is grown; where nothing is yet, a cell in the midst of all that belong is the first.
-  void find_front(int cell) {
-    std::vector<Place> candidates;
-    bool any = !inside_;
-    const auto bricks = field_.bricks();
-    for (int z = 0; z < bricks[2]; ++z)
-      for (int y = 0; y < bricks[1]; ++y)
-        for (int x = 0; x < bricks[0]; ++x) {
-          const size_t brick = field_.brick_index(x, y, z);
-          if (whole_[brick] != 0) {
-            any = true;
-            continue;
-          }
-          const int32_t block = field_.brick(brick);
-          if (block == (inside_ ? Field::all_outside : Field::all_inside) || (block >= 0 && cell == side)) continue;
-          for (int k = 0; k < side; k += cell)
-            for (int j = 0; j < side; j += cell)
-              for (int i = 0; i < side; i += cell) {
-                const Place p{x * side + i, y * side + j, z * side + k};
-                if (grown(p))
-                  any = true;
-                else if (belongs_all(p, cell))
-                  candidates.push_back(p);
-              }
-        }
+  /// Puts the cells beside what is grown into the queue; where nothing is yet, a cell in the midst of all that belong
+  /// is the first.
+  template <int cell>
+  void find_front() {
+    const std::vector<Cell> candidates = find_candidates<cell>();
     if (candidates.empty()) return;
-    if (!any) {
-      const Place seed = candidates[candidates.size() / 2];
-      add(seed, cell);
-    }
-    for (const Place& p : candidates) {
-      bool beside = false;
-      for_each_around(p, cell, [&](int bit, const Place& q) {
-        beside = beside || ((adjacency.faces >> bit & 1U) != 0 && grown(q));
-      });
-      if (beside && !grown(p)) offer(p, cell, true);
+    if (!any_) add<cell>(candidates[candidates.size() / 2]);
+    for (const Cell& c : candidates) {
+      if ((state_of<cell>(c) & (grown_bit | waiting_bit)) != 0) continue;
+      const Around<cell> around(*this, c);
+      const auto grown = [&](int dx, int dy, int dz) {
+        return (state_of<cell>(around.at(dx, dy, dz)) & grown_bit) != 0;
+      };
+      if (grown(-1, 0, 0) || grown(1, 0, 0) || grown(0, -1, 0) || grown(0, 1, 0) || grown(0, 0, -1) || grown(0, 0, 1))
+        offer<cell>(c);
     }
   }
 
-  std::vector<std::vector<Place>> left_out() {
-    std::vector<std::vector<Place>> parts;
-    const auto bricks = field_.bricks();
-    const auto wanted = [&](const Place& p) {
-      return on_grid(p) && belongs(p) && !grown(p) && (*state(p) & waiting_bit) == 0;
-    };
-    for (int z = 0; z < bricks[2]; ++z)
-      for (int y = 0; y < bricks[1]; ++y)
-        for (int x = 0; x < bricks[0]; ++x) {
-          const size_t brick = field_.brick_index(x, y, z);
-          const int32_t block = field_.brick(brick);
-          if (whole_[brick] != 0 || block == (inside_ ? Field::all_outside : Field::all_inside)) continue;
-          for (int s = 0; s < static_cast<int>(Field::samples_per_brick); ++s) {
-            const Place start{x * side + s % side, y * side + s / side % side, z * side + s / (side * side)};
-            if (!wanted(start)) continue;
-            std::vector<Place>& part = parts.emplace_back();
-            part.push_back(start);
-            *state(start) |= waiting_bit;
-            for (size_t n = 0; n < part.size(); ++n)
-              for_each_around(Place(part[n]), 1, [&](int, const Place& q) {
-                if (!wanted(q)) return;
-                *state(q) |= waiting_bit;
-                part.push_back(q);
-              });
-          }
-        }
+  /// Marks the cells that should belong and are not grown yet, and returns them.
+  template <int cell>
+  std::vector<Cell> find_candidates() {
+    std::vector<Cell> candidates;
+    solid_.for_each_brick([&](uint32_t brick, size_t) {
+      if (page_of_[brick] == grown_page) return;
+      const BrickBits cells = whole_cells<cell>(belonging(brick));
+      if (cells == BrickBits{}) return;
+      if constexpr (cell == side) {
+        bricks_[brick] = belongs_bit;
+        if (solid_.block(brick) < 0) candidates.push_back({brick, 0});
+        return;
+      }
+      give_page(brick);
+      for_each_sample(cells, [&](uint16_t sample) {
+        const Cell c{brick, sample};
+        uint8_t& own = state(c);
+        if ((own & grown_bit) != 0) return;
+        own |= belongs_bit;
+        candidates.push_back(c);
+      });
+    });
+    return candidates;
+  }
+
+  void keep_grown() {
+    for (uint8_t& value : bricks_) value &= grown_bit;
+    for (auto& page : pages_)
+      for (uint8_t& value : page) value &= grown_bit;
+  }
+
+  std::vector<std::vector<Cell>> left_out() {
+    std::vector<std::vector<Cell>> parts;
+    for (const Cell& start : find_candidates<1>()) {
+      if ((state(start) & belongs_bit) == 0) continue;
+      state(start) = 0;
+      std::vector<Cell>& part = parts.emplace_back();
+      part.push_back(start);
+      for (size_t n = 0; n < part.size(); ++n)
+        Around<1>(*this, part[n]).for_each([&](int, const Cell& q) {
+          if ((state(q) & belongs_bit) == 0) return;
+          state(q) = 0;
+          part.push_back(q);
+        });
+    }
     return parts;
   }
 
-  const Field& field_;
+  const Solid& solid_;
   bool inside_;
   const Work& work_;
-  std::array<int, 3> samples_{};
-  std::vector<uint8_t> whole_;  ///< by brick: grown as a whole
-  std::vector<int32_t> detail_of_;
-  std::vector<std::array<uint8_t, Field::samples_per_brick>> details_;
-  std::array<std::vector<Place>, depths> queue_;
+  std::array<int64_t, 3> brick_step_{};                               ///< from a brick to the next along x, y, z
+  std::vector<uint8_t> bricks_;                                       ///< states of whole bricks, while cells are these
+  std::vector<uint32_t> page_of_;                                     ///< by brick
+  std::vector<std::array<uint8_t, Field::samples_per_brick>> pages_;  ///< states of samples, or of cells at their first
+  bool any_;                                                          ///< whether anything is grown
+  SimpleCells simple_;
+  std::array<std::vector<Cell>, depths> queue_;
   std::array<size_t, depths> taken_{};
 };
 
 /// Parts minus rings, plus cavities, of the inside as marching cubes joins it: samples that are neighbours along an
 /// axis hang together. Counted as in a complex whose cells are samples, and pairs, squares and cubes of samples.
-long euler_number(const Field& field) {
-  const auto bricks = field.bricks();
+long euler_number(const Solid& solid) {
+  // A plane of 8 × 8 samples, and for each of them the next along x, along y and along both.
+  struct Plane {
+    uint64_t own, x, y, xy;
+  };
+  constexpr uint64_t first_column = 0x0101010101010101U;
+  const auto next_x = [](uint64_t plane, uint64_t beside) {
+    return (plane >> 1 & ~(first_column << (side - 1))) | (beside & first_column) << (side - 1);
+  };
+  const auto next_y = [](uint64_t plane, uint64_t below) { return plane >> side | below << (side * side - side); };
+  const auto plane_of = [&](size_t brick, size_t k) {
+    const auto [dx, dy, dz] = solid.step();
+    const uint64_t own = solid.bits(brick)[k], x = solid.bits(brick + dx)[k];
+    const uint64_t y = solid.bits(brick + dy)[k], xy = solid.bits(brick + dx + dy)[k];
+    return Plane{own, next_x(own, x), next_y(own, y), next_y(next_x(own, x), next_x(y, xy))};
+  };
   long number = 0;
-  constexpr int reach = side + 1;
-  std::array<uint8_t, static_cast<size_t>(reach) * reach * reach> solid{};  // a brick and its next samples
-  for (int z = 0; z < bricks[2]; ++z)
-    for (int y = 0; y < bricks[1]; ++y)
-      for (int x = 0; x < bricks[0]; ++x) {
-        if (field.brick(field.brick_index(x, y, z)) == Field::all_outside) continue;
-        bool all_solid = true;
-        for (int part = 0; part < 8; ++part) {
-          const int i0 = (part & 1) * side, j0 = (part >> 1 & 1) * side, k0 = (part >> 2) * side;
-          const std::array<int, 3> at{x + (part & 1), y + (part >> 1 & 1), z + (part >> 2)};
-          const bool exists = at[0] < bricks[0] && at[1] < bricks[1] && at[2] < bricks[2];
-          const int32_t block = exists ? field.brick(field.brick_index(at[0], at[1], at[2])) : Field::all_outside;
-          all_solid = all_solid && block == Field::all_inside;
-          for (int k = k0; k < std::min(k0 + side, reach); ++k)
-            for (int j = j0; j < std::min(j0 + side, reach); ++j)
-              for (int i = i0; i < std::min(i0 + side, reach); ++i)
-                solid[static_cast<size_t>((k * reach + j) * reach + i)] =
-                    block < 0 ? block == Field::all_inside
-                              : field.block(block)[((k - k0) * side + j - j0) * side + i - i0] < 0;
-        }
-        if (all_solid) continue;  // each of its samples adds 1 - 3 + 3 - 1
-        for (int k = 0; k < side; ++k)
-          for (int j = 0; j < side; ++j)
-            for (int i = 0; i < side; ++i) {
-              const uint8_t* s = &solid[static_cast<size_t>((k * reach + j) * reach + i)];
-              if (s[0] == 0) continue;
-              constexpr int up = reach, far = reach * reach;
-              const int xy = s[1] & s[up], xz = s[1] & s[far], yz = s[up] & s[far];
-              const int square_xy = xy & s[1 + up], square_xz = xz & s[1 + far], square_yz = yz & s[up + far];
-              number += 1 - (s[1] + s[up] + s[far]) + (square_xy + square_xz + square_yz) -
-                        (square_xy & square_xz & square_yz & s[1 + up + far]);
-            }
-      }
+  solid.for_each_brick([&](uint32_t brick, size_t) {
+    if (solid.block(brick) == Field::all_outside) return;
+    Plane near = plane_of(brick, 0);
+    for (size_t k = 0; k < side; ++k) {
+      const Plane far = k + 1 < side ? plane_of(brick, k + 1) : plane_of(brick + solid.step()[2], 0);
+      const uint64_t pair_x = near.own & near.x, pair_y = near.own & near.y, pair_z = near.own & far.own;
+      const uint64_t square_xy = pair_x & near.y & near.xy, square_xz = pair_x & far.own & far.x;
+      const uint64_t square_yz = pair_y & far.own & far.y, cube = square_xy & square_xz & square_yz & far.xy;
+      number += std::popcount(near.own) - std::popcount(pair_x) - std::popcount(pair_y) - std::popcount(pair_z) +
+                std::popcount(square_xy) + std::popcount(square_xz) + std::popcount(square_yz) - std::popcount(cube);
+      near = far;
+    }
+  });
   return number;
 }
 
-size_t flip_small_layers(Field& field, bool inside, double area_m2, const Work& work) {
-  const auto parts = Growth(field, inside, work).run();
+size_t flip_small_layers(Field& field, const Solid& solid, bool inside, double area_m2, const Work& work) {
+  const auto parts = Growth(solid, inside, work).run();
   const double sample_m2 = field.grid().voxel_m * field.grid().voxel_m;
   // Half a voxel from the surface: nearer, opposite sides of a cut would touch once they are smoothed.
   const auto flipped_m = static_cast<float>(0.5 * field.grid().voxel_m);
   size_t flipped = 0;
   for (const auto& part : parts) {
     if (static_cast<double>(part.size()) * sample_m2 > area_m2) continue;
-    for (const auto& [i, j, k] : part) {
-      const int32_t block = field.brick(field.brick_index(i / side, j / side, k / side));
+    for (const auto& [brick, sample] : part) {
+      const int32_t block = solid.block(brick);
       if (block < 0) continue;
-      float& value = field.block(block)[((k % side) * side + j % side) * side + i % side];
-      value = inside ? flipped_m : -flipped_m;
+      field.block(block)[sample] = inside ? flipped_m : -flipped_m;
       ++flipped;
     }
   }
@@ -352,10 +472,14 @@ RemovedHandles remove_small_handles(Field& field, const HandleRemovalOptions& op
   RemovedHandles removed;
   if (field.bricks()[0] == 0) return removed;
   constexpr long without_handles = 1;
-  if (euler_number(field) == without_handles) return removed;
-  removed.filled_samples = flip_small_layers(field, false, options.area_m2, work);
-  if (euler_number(field) == without_handles) return removed;
-  removed.cut_samples = flip_small_layers(field, true, options.area_m2, work);
+  {
+    const Solid solid(field, work);
+    if (euler_number(solid) == without_handles) return removed;
+    removed.filled_samples = flip_small_layers(field, solid, false, options.area_m2, work);
+  }
+  const Solid filled(field, work);
+  if (euler_number(filled) == without_handles) return removed;
+  removed.cut_samples = flip_small_layers(field, filled, true, options.area_m2, work);
   return removed;
 }
 
