@@ -125,7 +125,10 @@ class Parts {
         for (int x = 0; x < bricks[0]; ++x) visit(std::array{x, y, z}, field_.brick_index(x, y, z));
   }
 
-  /// Calls `visit` with a sample of one brick and the sample beside it of the next.
+  static constexpr uint32_t none = std::numeric_limits<uint32_t>::max();
+
+  /// Calls `visit` with a sample of one brick and the sample beside it of the next, at least once for every two parts
+  /// that touch.
   template <class Visitor>
   void for_each_contact(const Visitor& visit) const {
     for_each_brick([&](const std::array<int, 3>& place, size_t brick) {
@@ -138,8 +141,17 @@ class Parts {
           visit(brick, (side - 1) * step, other, 0);
           continue;
         }
-        for (int sample = 0; sample < samples_per_brick; ++sample)
-          if (along(sample, axis) == 0) visit(brick, sample + (side - 1) * step, other, sample);
+        uint32_t last_node = none, last_other = none;
+        for (int sample = 0; sample < samples_per_brick; ++sample) {
+          if (along(sample, axis) != 0) continue;
+          const int own = sample + (side - 1) * step;
+          // Most samples of a face repeat what the one before them told.
+          const uint32_t to = node(other, sample), from = node(brick, own);
+          if (from == last_node && to == last_other) continue;
+          last_node = from;
+          last_other = to;
+          visit(brick, own, other, sample);
+        }
       }
     });
   }
