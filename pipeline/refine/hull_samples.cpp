@@ -92,17 +92,26 @@ std::vector<GrazingRay> measure_slack(const Field& hull, const SilhouetteViews& 
     const Eigen::Vector3f q = (p - origin) * per_voxel;
     std::array<int, 3> n{};
     std::array<float, 3> share{};
+    bool in_one_brick = true;
     for (size_t a = 0; a < 3; ++a) {
       const float place = q[static_cast<Eigen::Index>(a)];
       if (!(place >= 0) || !(place < static_cast<float>(grid.size[a] - 1))) return most_m;
       n[a] = static_cast<int>(place);
       share[a] = place - static_cast<float>(n[a]);
+      in_one_brick = in_one_brick && n[a] % side != side - 1;
     }
-    float sum = 0;
-    for (int c = 0; c < 8; ++c)
-      sum += ((c & 1) != 0 ? share[0] : 1 - share[0]) * ((c & 2) != 0 ? share[1] : 1 - share[1]) *
-             ((c & 4) != 0 ? share[2] : 1 - share[2]) * hull.at(n[0] + (c & 1), n[1] + (c >> 1 & 1), n[2] + (c >> 2));
-    return sum;
+    const auto mean = [&](const auto& at) {
+      float sum = 0;
+      for (int c = 0; c < 8; ++c)
+        sum += ((c & 1) != 0 ? share[0] : 1 - share[0]) * ((c & 2) != 0 ? share[1] : 1 - share[1]) *
+               ((c & 4) != 0 ? share[2] : 1 - share[2]) * at(c & 1, c >> 1 & 1, c >> 2);
+      return sum;
+    };
+    if (!in_one_brick) return mean([&](int i, int j, int k) { return hull.at(n[0] + i, n[1] + j, n[2] + k); });
+    const int32_t block = hull.brick(hull.brick_index(n[0] / side, n[1] / side, n[2] / side));
+    if (block < 0) return block == Field::all_outside ? 1.0F : -1.0F;
+    const float* first = hull.block(block) + ((n[2] % side) * side + n[1] % side) * side + n[0] % side;
+    return mean([&](int i, int j, int k) { return first[(k * side + j) * side + i]; });
   };
   std::vector<std::vector<GrazingRay>> rays(samples.size());
   const auto measure = [&](size_t s) {
