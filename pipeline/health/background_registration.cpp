@@ -70,6 +70,9 @@ std::vector<float> lightness_of(const Image& image, int step, int width, int hei
   const int channels = image.channels;
   const int channel = channels == 3 ? 1 : 0;
   const float weight = 1.0F / static_cast<float>(step * step);
+  std::vector<float> lightness_of_sum(static_cast<size_t>(255 * step * step) + 1);
+  for (size_t sum = 0; sum < lightness_of_sum.size(); ++sum)
+    lightness_of_sum[sum] = std::log(static_cast<float>(sum) * weight + srgb_offset);
   std::vector<int> sums(static_cast<size_t>(width));
   for (int y = 0; y < height; ++y) {
     std::fill(sums.begin(), sums.end(), 0);
@@ -79,7 +82,7 @@ std::vector<float> lightness_of(const Image& image, int step, int width, int hei
         for (int dx = 0; dx < step; ++dx, samples += channels) sum += *samples;
     }
     float* row = lightness.data() + static_cast<size_t>(y) * static_cast<size_t>(width);
-    for (size_t x = 0; x < sums.size(); ++x) row[x] = std::log(static_cast<float>(sums[x]) * weight + srgb_offset);
+    for (size_t x = 0; x < sums.size(); ++x) row[x] = lightness_of_sum[static_cast<size_t>(sums[x])];
   }
   return lightness;
 }
