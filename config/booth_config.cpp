@@ -100,6 +100,7 @@ void visit_retention(Visitor& visitor, RetentionConfig& retention) {
 template <class Visitor>
 void visit_jobs(Visitor& visitor, JobsConfig& jobs) {
   visitor.integer("workers", jobs.workers, 1, 64);
+  visitor.boolean("head_start", jobs.head_start);
   visitor.integer("threads", jobs.threads, 0, 256);
   visitor.integer("timeout_s", jobs.timeout_s, 1, 86400);
   visitor.integer("memory_mib", jobs.memory_mib, 0, 10'000'000);

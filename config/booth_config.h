@@ -78,11 +78,12 @@ struct RetentionConfig {
 };
 
 struct JobsConfig {
-  int workers = 1;      ///< reconstructions at the same time, 1 … 64
-  int threads = 0;      ///< of one reconstruction, 0 … 256; 0: as many as there are processors
-  int timeout_s = 300;  ///< after which a reconstruction is stopped and has failed, 1 … 86400
-  int memory_mib = 0;   ///< most that one reconstruction may take, 0 … 10^7; 0: three quarters of the machine's
-  int retries = 1;      ///< of a reconstruction whose process died, hung or took too much memory, 0 … 10
+  int workers = 1;         ///< reconstructions at the same time, 1 … 64
+  bool head_start = true;  ///< a reconstruction begins while its capture is still under way
+  int threads = 0;         ///< of one reconstruction, 0 … 256; 0: as many as there are processors
+  int timeout_s = 300;     ///< after which a reconstruction is stopped and has failed, 1 … 86400
+  int memory_mib = 0;      ///< most that one reconstruction may take, 0 … 10^7; 0: three quarters of the machine's
+  int retries = 1;         ///< of a reconstruction whose process died, hung or took too much memory, 0 … 10
 };
 
 struct FaceConfig {

@@ -80,6 +80,17 @@ Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<D
   if (const auto opened = booth->open_stores(); !opened) return opened.error();
   booth->disk_guard_.measure();
   if (const auto opened = booth->open_calibration(devices); !opened) return opened.error();
+  const BoothConfig& config = options.config;
+  const ReconstructProgram program{.command = options.reconstruct_command,
+                                   .config_file = options.config_file,
+                                   .recordings = config.booth.recordings(),
+                                   .avatars = config.booth.avatars(),
+                                   .cache = config.booth.cache(),
+                                   .threads = config.jobs.threads,
+                                   .timeout = std::chrono::seconds(config.jobs.timeout_s),
+                                   .most_bytes = static_cast<uint64_t>(config.jobs.memory_mib) * mebibyte};
+  booth->head_start_ =
+      std::make_unique<HeadStart>(program, config.jobs.head_start ? config.jobs.workers : 0, *booth->jobs_);
   if (devices) {
     booth->open_capture(*devices);
   } else {
@@ -89,23 +100,14 @@ Result<std::unique_ptr<Booth>> Booth::open(const BoothOptions& options, Result<D
   booth->adopt_orphans();
   booth->name_interrupted();
 
-  const BoothConfig& config = options.config;
   booth->runner_ = std::make_unique<JobRunner>(
-      JobRunnerOptions{.command = options.reconstruct_command,
-                       .config_file = options.config_file,
-                       .recordings = config.booth.recordings(),
-                       .cache = config.booth.cache(),
-                       .workers = config.jobs.workers,
-                       .threads = config.jobs.threads,
-                       .timeout = std::chrono::seconds(config.jobs.timeout_s),
-                       .most_bytes = static_cast<uint64_t>(config.jobs.memory_mib) * mebibyte,
-                       .retries = config.jobs.retries},
-      *booth->jobs_, *booth->avatars_, booth->events_, booth->metrics_,
+      JobRunnerOptions{program, config.jobs.workers, config.jobs.retries}, *booth->jobs_, *booth->head_start_,
+      *booth->avatars_, booth->events_, booth->metrics_,
       [self = booth.get()](const std::string& capture, const std::vector<CameraHealth>& cameras) {
         self->health_.report(capture, cameras);
       });
-  booth->eraser_ = std::make_unique<Eraser>(config.booth.state_directory, *booth->jobs_, *booth->avatars_,
-                                            *booth->journal_, booth->session_.get(), booth->events_);
+  booth->eraser_ = std::make_unique<Eraser>(config.booth.state_directory, *booth->jobs_, *booth->head_start_,
+                                            *booth->avatars_, *booth->journal_, booth->session_.get(), booth->events_);
   booth->set_state(booth->device_fault_.empty() ? BoothState::idle : BoothState::fault);
   booth->housekeeper_ = std::jthread([self = booth.get()](const std::stop_token& stop) { self->keep_house(stop); });
   pthread_setname_np(booth->housekeeper_.native_handle(), "house");
@@ -250,6 +252,7 @@ void Booth::open_capture(const Devices& devices) {
                    .journal = *journal_,
                    .devices = [this] { return this->devices(); },
                    .jobs = *jobs_,
+                   .head_start = *head_start_,
                    .events = events_,
                    .metrics = metrics_,
                    .clock = clock_,

@@ -22,6 +22,7 @@
 #include "daemon/disk_guard.h"
 #include "daemon/eraser.h"
 #include "daemon/event_bus.h"
+#include "daemon/head_start.h"
 #include "daemon/health_history.h"
 #include "daemon/health_monitor.h"
 #include "daemon/job_queue.h"
@@ -214,6 +215,7 @@ class Booth {
   int state_lock_ = -1;  ///< an open descriptor, locked while this booth uses the state directory
 
   std::unique_ptr<JobQueue> jobs_;
+  std::unique_ptr<HeadStart> head_start_;
   std::unique_ptr<AvatarStore> avatars_;
   std::unique_ptr<CaptureJournal> journal_;
   std::unique_ptr<HealthHistory> history_;

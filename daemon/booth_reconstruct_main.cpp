@@ -86,7 +86,7 @@ class StopOnSignal {
 
 struct Arguments {
   std::string recording, avatar, config, face, texture, trace, cache;
-  bool timings = false, learn = false;
+  bool timings = false, learn = false, growing = false;
   int progress_fd = -1;
   unsigned threads = 0;
 };
@@ -153,18 +153,24 @@ int run(const Arguments& arguments) {
   if (!arguments.cache.empty()) kept.emplace(arguments.cache);
   FaceModelLoader face_model(config.face.landmark_model);
   // Beside the stages that come before it, so that it need not be waited for.
-  if (const auto recording = read_recording(arguments.recording);
-      recording && (options.face == FaceMode::passive ||
-                    (options.face == FaceMode::automatic && recording->find(ShotRole::gray_code) == nullptr)))
-    face_model.start();
+  if (options.face == FaceMode::passive) face_model.start();
+  const auto on_complete = [&](const Recording& recording) {
+    if (options.face == FaceMode::automatic && recording.find(ShotRole::gray_code) == nullptr) face_model.start();
+  };
+  auto recording =
+      arguments.growing ? RecordingSource(arguments.recording, STDIN_FILENO) : RecordingSource(arguments.recording);
   const auto made = reconstruct_recording(
-      arguments.recording, arguments.avatar, options,
-      {[&] { return face_model.get(); }, [&] { return load_face_detector(config.face.cascade); }}, config.files, work,
+      recording, arguments.avatar, options,
+      {.model = [&] { return face_model.get(); },
+       .detector = [&] { return load_face_detector(config.face.cascade); },
+       .kept = kept ? &*kept : nullptr,
+       .on_complete = on_complete},
+      config.files, work,
       [&](std::string_view stage, double fraction) {
         if (draw) bar.draw(stage, fraction);
         pipe.tell({{"stage", stage}, {"fraction", fraction}});
       },
-      [&](const std::vector<CameraHealth>& cameras) { tell_health(pipe, cameras); }, kept ? &*kept : nullptr);
+      [&](const std::vector<CameraHealth>& cameras) { tell_health(pipe, cameras); });
   bar.clear();
   if (!arguments.trace.empty() && !(std::ofstream(arguments.trace) << trace.json() << std::flush))
     std::cerr << "warning: " << arguments.trace << ": the trace cannot be written\n";
@@ -206,6 +212,11 @@ int main(int argc, char** argv) {
   auto* learn = app.add_flag("--learn", arguments.learn, "learn the empty booth into the cache, make no avatar")
                     ->needs(cache)
                     ->excludes(avatar);
+  app.add_flag(
+         "--growing", arguments.growing,
+         "the recording is still being written: standard input says, a line each, {\"so_far\": \"FOLDER\"} for what "
+         "can be read already, and at last {\"complete\": true}")
+      ->excludes(learn);
   app.add_option("--threads", arguments.threads, "how many to use; 0 for as many as there are processors")
       ->check(CLI::Range(0, 1024));
   app.add_option("--progress-fd", arguments.progress_fd,

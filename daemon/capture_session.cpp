@@ -2,11 +2,14 @@
 
 #include <pthread.h>
 #include <spdlog/spdlog.h>
+#include <sys/resource.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <exception>
+#include <future>
 #include <map>
 #include <utility>
 
@@ -50,6 +53,13 @@ Error was_cancelled() { return {ErrorCode::cancelled, "the capture was cancelled
 bool has_all(const std::map<std::string, Frame>& frames, const std::vector<std::string>& cameras) {
   return std::all_of(cameras.begin(), cameras.end(),
                      [&](const std::string& camera) { return frames.contains(camera); });
+}
+
+/// What the calling thread does from now on waits for whoever takes frames.
+void yield_to_cameras() {
+  constexpr int niceness = 10;
+  // Where that is refused, it competes.
+  (void)::setpriority(PRIO_PROCESS, static_cast<id_t>(::gettid()), niceness);
 }
 
 double elapsed_s(Timestamp from, Timestamp to) { return static_cast<double>(to - from) / 1e9; }
@@ -319,6 +329,7 @@ bool CaptureSession::conclude(const std::string& id, const CaptureRequest& reque
     // From here on whoever deletes it finds the job.
     if (stays) parts_.jobs.add({.id = id, .face = std::string(to_string(request.face)), .label = request.label});
   }
+  if (!stays) parts_.head_start.drop(id);
   if (taken && !stays) {
     // Deleted while it was written: whoever waits for its end finds nothing left.
     if (const auto removed = remove_folder(parts_.recordings, id); !removed)
@@ -349,6 +360,7 @@ Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& r
                ? added.error()
                : Error{ErrorCode::no_background,
                        "the learned background does not fit, learn it again: " + added.error().message};
+  show_so_far(id, request.face, **writer);
 
   CollectedShot body;
   {
@@ -363,8 +375,17 @@ Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& r
     if (!taken) return taken.error();
     body = std::move(*taken);
   }
+  const bool patterns = patterns_wanted(request.face);
+  if (const auto begun = (*writer)->begin_shot({.name = body_shot, .role = ShotRole::body}); !begun) return begun;
+  // Beside the patterns, so that the reconstruction can begin while they are shown.
+  auto body_written = std::async(patterns ? std::launch::async : std::launch::deferred, [&, patterns] {
+    if (patterns) yield_to_cameras();
+    const auto written = write(**writer, body_shot, body.set.frames, patterns ? Work{} : encoders_.work(), cancelled);
+    if (written) show_so_far(id, request.face, **writer);
+    return written;
+  });
   std::vector<Frame> face;
-  if (patterns_wanted(request.face)) {
+  if (patterns) {
     auto taken = take_patterns(id, parts_.cameras.ids(CameraRole::face), cancelled);
     if (taken)
       face = std::move(*taken);
@@ -376,8 +397,7 @@ Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& r
   }
 
   // The subject may move again; the disk has time.
-  if (const auto begun = (*writer)->begin_shot({.name = body_shot, .role = ShotRole::body}); !begun) return begun;
-  if (const auto written = write(**writer, body_shot, body.set.frames, cancelled); !written) return written;
+  if (const auto written = body_written.get(); !written) return written;
   if (!face.empty()) {
     const auto projector = projector_->get();
     if (!projector) return projector.error();
@@ -385,11 +405,18 @@ Result<void> CaptureSession::take(const std::string& id, const CaptureRequest& r
             {.name = face_shot, .role = ShotRole::gray_code, .pattern = (*projector)->info().pattern});
         !begun)
       return begun;
-    if (const auto written = write(**writer, face_shot, face, cancelled); !written) return written;
+    if (const auto written = write(**writer, face_shot, face, encoders_.work(), cancelled); !written) return written;
   }
   if (!begin_commit(id)) return was_cancelled();
   pulse_.beat();
   return (*writer)->commit();
+}
+
+/// Lets the reconstruction begin with what there is.
+void CaptureSession::show_so_far(const std::string& id, FaceMode face, RecordingWriter& writer) {
+  const auto folder = writer.show_so_far();
+  if (!folder) return spdlog::warn("capture {}: its reconstruction begins later: {}", id, folder.error().message);
+  parts_.head_start.grow(id, std::string(to_string(face)), *folder);
 }
 
 /// Announces the seconds that are left, from `next_s` on, until `until`.
@@ -624,10 +651,10 @@ Result<void> CaptureSession::take_pattern(const std::string& id, Projector& proj
 }
 
 Result<void> CaptureSession::write(RecordingWriter& writer, const std::string& shot, const std::vector<Frame>& frames,
-                                   const std::stop_token& cancelled) {
+                                   const Work& work, const std::stop_token& cancelled) {
   std::mutex mutex;
   Result<void> outcome;
-  encoders_.run(frames.size(), 1, [&](size_t begin, size_t end) {
+  work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end && !cancelled.stop_requested(); ++i) {
       const auto added = writer.add(shot, frames[i]);
       const std::lock_guard lock(mutex);
@@ -711,7 +738,8 @@ Result<CaptureSession::Views> CaptureSession::take_background(const std::string&
       seen.push_back(coarse_view(frame));
       wanted.push_back(std::move(frame));
     }
-    if (const auto written = write(writer, background_shot, wanted, cancelled); !written) return written.error();
+    if (const auto written = write(writer, background_shot, wanted, encoders_.work(), cancelled); !written)
+      return written.error();
     parts_.tasks.progress(task, std::min(1.0, (trigger + 1.0) / frames));
     if (std::all_of(views.begin(), views.end(),
                     [&](const auto& view) { return view.second.size() == static_cast<size_t>(frames); }))

@@ -23,6 +23,7 @@
 #include "daemon/empty_booth.h"
 #include "daemon/event_bus.h"
 #include "daemon/frame_collector.h"
+#include "daemon/head_start.h"
 #include "daemon/job_queue.h"
 #include "daemon/metrics.h"
 #include "daemon/pulse.h"
@@ -76,6 +77,7 @@ struct CaptureParts {
   const CaptureJournal& journal;
   std::function<std::vector<BoothDevice>()> devices;  ///< every camera
   JobQueue& jobs;
+  HeadStart& head_start;
   EventBus& events;
   Metrics& metrics;
   const Clock& clock;
@@ -175,7 +177,8 @@ class CaptureSession {
                             std::map<std::string, Frame>& delivered, FrameCollector& collector, int& repeats_left,
                             const std::stop_token& cancelled);
   Result<void> write(RecordingWriter& writer, const std::string& shot, const std::vector<Frame>& frames,
-                     const std::stop_token& cancelled);
+                     const Work& work, const std::stop_token& cancelled);
+  void show_so_far(const std::string& id, FaceMode face, RecordingWriter& writer);
 
   // The tasks.
   Result<TaskResult> work(const std::string& task, const BackgroundRequest& request, const std::stop_token& cancelled);

@@ -5,6 +5,7 @@
 #include <signal.h>
 #include <sys/prctl.h>
 #include <sys/resource.h>
+#include <sys/socket.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -34,6 +35,18 @@ std::optional<Pipe> make_pipe() {
   return Pipe{ends[0], ends[1]};
 }
 
+/// What a child reads as its standard input.
+std::optional<Pipe> make_input(ChildProcess::Input input) {
+  if (input == ChildProcess::Input::empty) {
+    const int null = ::open("/dev/null", O_RDONLY | O_CLOEXEC);
+    return null < 0 ? std::nullopt : std::optional(Pipe{null, -1});
+  }
+  std::array<int, 2> ends{};
+  if (::socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, ends.data()) != 0) return std::nullopt;
+  ::shutdown(ends[0], SHUT_WR);
+  return Pipe{ends[0], ends[1]};
+}
+
 void close_all(std::initializer_list<int> descriptors) {
   for (const int descriptor : descriptors)
     if (descriptor >= 0) ::close(descriptor);
@@ -46,7 +59,7 @@ void write_errno(int descriptor) {
 }
 
 /// Between fork and exec only async-signal-safe functions may be called: other threads' locks were copied locked.
-[[noreturn]] void become(char* const* arguments, pid_t parent, int progress, int output, int fault) {
+[[noreturn]] void become(char* const* arguments, pid_t parent, int input, int progress, int output, int fault) {
   constexpr int exec_failed = 127;
   ::setpgid(0, 0);
   ::prctl(PR_SET_PDEATHSIG, SIGKILL);
@@ -70,13 +83,13 @@ void write_errno(int descriptor) {
 
   // The numbers used below must not be among those about to be overwritten.
   constexpr int above = progress_number + 2;
-  const int null = ::open("/dev/null", O_RDONLY | O_CLOEXEC);
+  const int moved_input = ::fcntl(input, F_DUPFD_CLOEXEC, above);
   const int moved_progress = ::fcntl(progress, F_DUPFD_CLOEXEC, above);
   const int moved_output = ::fcntl(output, F_DUPFD_CLOEXEC, above);
   const int moved_fault = ::fcntl(fault, F_DUPFD_CLOEXEC, above);
-  if (null < 0 || moved_progress < 0 || moved_output < 0 || moved_fault < 0 || ::dup2(null, STDIN_FILENO) < 0 ||
-      ::dup2(moved_output, STDOUT_FILENO) < 0 || ::dup2(moved_output, STDERR_FILENO) < 0 ||
-      ::dup2(moved_progress, progress_number) < 0) {
+  if (moved_input < 0 || moved_progress < 0 || moved_output < 0 || moved_fault < 0 ||
+      ::dup2(moved_input, STDIN_FILENO) < 0 || ::dup2(moved_output, STDOUT_FILENO) < 0 ||
+      ::dup2(moved_output, STDERR_FILENO) < 0 || ::dup2(moved_progress, progress_number) < 0) {
     write_errno(fault);
     ::_exit(exec_failed);
   }
@@ -89,17 +102,18 @@ void write_errno(int descriptor) {
 
 }  // namespace
 
-Result<ChildProcess> ChildProcess::start(const std::vector<std::string>& command) {
+Result<ChildProcess> ChildProcess::start(const std::vector<std::string>& command, Input kind) {
+  const auto input = make_input(kind);
   const auto progress = make_pipe();
   const auto output = make_pipe();
   const auto fault = make_pipe();  // closed by a successful exec, else it says why there was none
   const auto give_up = [&](const std::string& doing, int number) {
-    for (const auto& ends : {progress, output, fault})
+    for (const auto& ends : {input, progress, output, fault})
       if (ends) close_all({ends->read, ends->write});
     return Error{number == ENOENT || number == EACCES ? ErrorCode::not_found : ErrorCode::io,
                  command.front() + ": " + doing + ": " + std::generic_category().message(number)};
   };
-  if (!progress || !output || !fault) return give_up("no pipe", errno);
+  if (!input || !progress || !output || !fault) return give_up("no pipe", errno);
 
   std::vector<std::string> texts = command;
   std::vector<char*> arguments;
@@ -109,12 +123,13 @@ Result<ChildProcess> ChildProcess::start(const std::vector<std::string>& command
   const pid_t parent = ::getpid();
   const pid_t pid = ::fork();
   if (pid < 0) return give_up("cannot be started", errno);
-  if (pid == 0) become(arguments.data(), parent, progress->write, output->write, fault->write);
+  if (pid == 0) become(arguments.data(), parent, input->read, progress->write, output->write, fault->write);
   ::setpgid(pid, pid);  // whoever comes first, parent or child
-  close_all({progress->write, output->write, fault->write});
+  close_all({input->read, progress->write, output->write, fault->write});
 
   ChildProcess child;
   child.pid_ = pid;
+  child.input_ = input->write;
   child.progress_ = progress->read;
   child.output_ = output->read;
   for (const int descriptor : {child.progress_, child.output_}) ::fcntl(descriptor, F_SETFL, O_NONBLOCK);
@@ -134,6 +149,7 @@ ChildProcess::ChildProcess(ChildProcess&& other) noexcept
     : pid_(std::exchange(other.pid_, -1)),
       progress_(std::exchange(other.progress_, -1)),
       output_(std::exchange(other.output_, -1)),
+      input_(std::exchange(other.input_, -1)),
       status_(other.status_) {}
 
 ChildProcess::~ChildProcess() {
@@ -143,7 +159,12 @@ ChildProcess::~ChildProcess() {
     while (::waitpid(pid_, &status, 0) < 0 && errno == EINTR) {
     }
   }
-  close_all({progress_, output_});
+  close_all({input_, progress_, output_});
+}
+
+bool ChildProcess::tell(std::string_view text) {
+  const ssize_t sent = ::send(input_, text.data(), text.size(), MSG_NOSIGNAL | MSG_DONTWAIT);
+  return sent == static_cast<ssize_t>(text.size());
 }
 
 void ChildProcess::kill() noexcept {

@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <optional>
 #include <string>
+#include <string_view>
 #include <vector>
 
 #include "pipeline/types/result.h"
@@ -15,10 +16,12 @@ namespace booth {
 /// and so with the daemon, however that ends. The destructor kills it and waits for it.
 class ChildProcess {
  public:
-  /// Starts `command` (a path, then its arguments) with nothing open but: standard input empty, standard output and
-  /// error together a pipe (output()), descriptor 3 another pipe (progress()).
+  enum class Input { empty, told };  ///< told: what tell() says
+
+  /// Starts `command` (a path, then its arguments) with nothing open but: standard input, standard output and error
+  /// together a pipe (output()), descriptor 3 another pipe (progress()).
   /// @error io  the operating system refused; not_found  the program cannot be executed
-  static Result<ChildProcess> start(const std::vector<std::string>& command);
+  static Result<ChildProcess> start(const std::vector<std::string>& command, Input input = Input::empty);
 
   ChildProcess(ChildProcess&& other) noexcept;
   ChildProcess& operator=(ChildProcess&&) = delete;
@@ -27,6 +30,9 @@ class ChildProcess {
   /// The reading ends, which do not block.
   int progress() const { return progress_; }
   int output() const { return output_; }
+
+  /// Writes to its standard input, without waiting for it to read. @return whether all of it was taken
+  bool tell(std::string_view text);
 
   /// SIGKILL to the whole group.
   void kill() noexcept;
@@ -41,6 +47,7 @@ class ChildProcess {
   ChildProcess() = default;
   pid_t pid_ = -1;
   int progress_ = -1, output_ = -1;
+  int input_ = -1;  ///< a socket, so that writing to a dead process raises no signal
   std::optional<int> status_;
 };
 

@@ -35,10 +35,11 @@ void unmark(const fs::path& state, const std::string& id) { ::unlink((marks_of(s
 
 }  // namespace
 
-Eraser::Eraser(const fs::path& state, JobQueue& jobs, AvatarStore& avatars, const CaptureJournal& journal,
-               CaptureSession* session, EventBus& events)
+Eraser::Eraser(const fs::path& state, JobQueue& jobs, HeadStart& head_start, AvatarStore& avatars,
+               const CaptureJournal& journal, CaptureSession* session, EventBus& events)
     : state_(state),
       jobs_(jobs),
+      head_start_(head_start),
       avatars_(avatars),
       journal_(journal),
       session_(session),
@@ -94,6 +95,7 @@ Result<void> Eraser::remove(const std::string& id) {
   if (session_ != nullptr) session_->wait_over(id);
   jobs_.forget(id);  // a capture that ended a moment ago may have left one
   jobs_.wait_released(id);
+  head_start_.drop(id);
   if (const auto removed = avatars_.remove(id); !removed) return removed;
   if (const auto removed = remove_folder(state_ / "recordings", id); !removed) return removed;
   if (const auto removed = jobs_.persist(id); !removed) return removed;

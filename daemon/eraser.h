@@ -9,6 +9,7 @@
 #include "daemon/capture_journal.h"
 #include "daemon/capture_session.h"
 #include "daemon/event_bus.h"
+#include "daemon/head_start.h"
 #include "daemon/job_queue.h"
 #include "daemon/serial_executor.h"
 #include "pipeline/types/result.h"
@@ -20,8 +21,8 @@ namespace booth {
 class Eraser {
  public:
   /// @param session  may be null
-  Eraser(const std::filesystem::path& state, JobQueue& jobs, AvatarStore& avatars, const CaptureJournal& journal,
-         CaptureSession* session, EventBus& events);
+  Eraser(const std::filesystem::path& state, JobQueue& jobs, HeadStart& head_start, AvatarStore& avatars,
+         const CaptureJournal& journal, CaptureSession* session, EventBus& events);
 
   /// Finishes what an earlier process did not; before the stores are opened. @error io
   static Result<void> finish_interrupted(const std::filesystem::path& state);
@@ -36,6 +37,7 @@ class Eraser {
 
   const std::filesystem::path state_;
   JobQueue& jobs_;
+  HeadStart& head_start_;
   AvatarStore& avatars_;
   const CaptureJournal& journal_;
   CaptureSession* const session_;

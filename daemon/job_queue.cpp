@@ -137,6 +137,14 @@ std::vector<Job> JobQueue::list() const {
   return jobs;
 }
 
+int JobQueue::unfinished() const {
+  const std::lock_guard lock(mutex_);
+  return static_cast<int>(std::count_if(entries_.begin(), entries_.end(), [](const auto& entry) {
+    const JobState state = entry.second.job.state;
+    return state == JobState::queued || state == JobState::running;
+  }));
+}
+
 std::optional<Job> JobQueue::find(const std::string& id) const {
   const std::lock_guard lock(mutex_);
   const auto found = entries_.find(id);

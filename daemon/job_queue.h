@@ -51,6 +51,7 @@ class JobQueue {
 
   std::vector<Job> list() const;  ///< oldest first
   std::optional<Job> find(const std::string& id) const;
+  int unfinished() const;  ///< how many are queued or running
 
   /// A new job, queued. One that is already there is left alone. No worker takes it before release(id).
   void add(const Job& job);

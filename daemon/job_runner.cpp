@@ -52,10 +52,6 @@ CameraHealth health_of(const Json& object) {
           .background_share = number_of(object, "background_share", 1)};
 }
 
-uint64_t three_quarters_of_memory() {
-  return static_cast<uint64_t>(::sysconf(_SC_PHYS_PAGES)) * static_cast<uint64_t>(::sysconf(_SC_PAGESIZE)) / 4 * 3;
-}
-
 std::string describe_end(int status, const std::string& last_words) {
   std::string text = WIFSIGNALED(status) ? "was killed by signal " + std::to_string(WTERMSIG(status))
                                          : "ended with status " + std::to_string(WEXITSTATUS(status));
@@ -74,10 +70,11 @@ struct JobRunner::Run {
   Tail output;
 };
 
-JobRunner::JobRunner(JobRunnerOptions options, JobQueue& jobs, AvatarStore& avatars, EventBus& events, Metrics& metrics,
-                     OnHealth on_health)
+JobRunner::JobRunner(JobRunnerOptions options, JobQueue& jobs, HeadStart& head_start, AvatarStore& avatars,
+                     EventBus& events, Metrics& metrics, OnHealth on_health)
     : options_(std::move(options)),
       jobs_(jobs),
+      head_start_(head_start),
       avatars_(avatars),
       events_(events),
       metrics_(metrics),
@@ -124,7 +121,7 @@ void JobRunner::work(const std::stop_token& stop, Pulse& pulse) {
 }
 
 void JobRunner::prepare(const std::filesystem::path& recording) {
-  if (options_.cache.empty()) return;
+  if (options_.program.cache.empty()) return;
   const std::lock_guard lock(mutex_);
   to_learn_ = recording;
 }
@@ -136,9 +133,9 @@ void JobRunner::learn(const std::stop_token& stop, Pulse& pulse) {
     recording = std::exchange(to_learn_, {});
   }
   if (recording.empty()) return;
-  auto child = ChildProcess::start({options_.command, recording, "--learn", "--cache", options_.cache});
+  auto child = ChildProcess::start({options_.program.command, recording, "--learn", "--cache", options_.program.cache});
   if (!child) return spdlog::warn("the background is not prepared: {}", child.error().message);
-  const auto deadline = SteadyClock::now() + options_.timeout;
+  const auto deadline = SteadyClock::now() + options_.program.timeout;
   Tail output;
   bool output_open = true;
   for (;;) {
@@ -168,20 +165,18 @@ void JobRunner::run(const JobQueue::Lease& lease, const std::stop_token& stop, P
   if (const auto removed = avatars_.remove(id); !removed) spdlog::warn("{}", removed.error().message);
 
   const auto started = SteadyClock::now();
-  std::vector<std::string> command{options_.command, options_.recordings / id, avatars_.folder() / id};
-  command.insert(command.end(), {"--progress-fd", "3", "--threads", std::to_string(options_.threads)});
-  if (!lease.job.face.empty()) command.insert(command.end(), {"--face", lease.job.face});
-  if (!options_.cache.empty()) command.insert(command.end(), {"--cache", options_.cache});
-  if (!options_.config_file.empty()) command.insert(command.end(), {"--config", options_.config_file});
-
   Run run;
   {
-    auto child = ChildProcess::start(command);
+    auto child = head_start_.take(id);
+    spdlog::info("job {}: {}", id, child ? "goes on with what its capture began" : "started");
     if (!child) {
-      run.error = Reason{"internal", child.error().message};
-      return conclude(lease, run);
+      auto fresh = ChildProcess::start(options_.program.arguments(id, lease.job.face));
+      if (!fresh) {
+        run.error = Reason{"internal", fresh.error().message};
+        return conclude(lease, run);
+      }
+      child.emplace(*std::move(fresh));
     }
-    spdlog::info("job {}: started", id);
 
     auto last_published = SteadyClock::time_point::min();
     LineReader lines;
@@ -206,8 +201,8 @@ void JobRunner::run(const JobQueue::Lease& lease, const std::stop_token& stop, P
       }
     };
 
-    const auto deadline = started + options_.timeout;
-    const uint64_t most_bytes = options_.most_bytes > 0 ? options_.most_bytes : three_quarters_of_memory();
+    const auto deadline = started + options_.program.timeout;
+    const uint64_t most_bytes = options_.program.memory_limit();
     bool progress_open = true, output_open = true;
     for (;;) {
       pulse.beat();
@@ -251,8 +246,8 @@ void JobRunner::conclude(const JobQueue::Lease& lease, const Run& run) {
     jobs_.fail(lease, run.error ? *run.error : Reason{"internal", describe_end(run.status, run.output.last_line())});
   } else if (run.end == Run::End::timed_out) {
     jobs_.died(lease, options_.retries,
-               {"timeout", "the reconstruction took longer than " + std::to_string(options_.timeout.count() / 1000) +
-                               " s and was stopped"});
+               {"timeout", "the reconstruction took longer than " +
+                               std::to_string(options_.program.timeout.count() / 1000) + " s and was stopped"});
   } else if (run.end == Run::End::too_large) {
     jobs_.died(
         lease, options_.retries,

@@ -12,23 +12,19 @@
 
 #include "daemon/avatar_store.h"
 #include "daemon/event_bus.h"
+#include "daemon/head_start.h"
 #include "daemon/job_queue.h"
 #include "daemon/metrics.h"
 #include "daemon/pulse.h"
+#include "daemon/reconstruct_program.h"
 #include "pipeline/types/camera_health.h"
 
 namespace booth {
 
 struct JobRunnerOptions {
-  std::filesystem::path command;      ///< the program that reconstructs: COMMAND RECORDING AVATAR --face MODE …
-  std::filesystem::path config_file;  ///< handed to it; may be empty
-  std::filesystem::path recordings;
-  std::filesystem::path cache;  ///< folder that it may keep things in from one job to the next; empty: none
+  ReconstructProgram program;
   int workers = 1;
-  int threads = 0;  ///< of one reconstruction; 0: as many as there are processors
-  std::chrono::milliseconds timeout{300'000};
-  uint64_t most_bytes = 0;  ///< of memory that one process may take; 0: three quarters of the machine's
-  int retries = 1;          ///< of a job whose process died, hung, or took too much memory
+  int retries = 1;  ///< of a job whose process died, hung, or took too much memory
 };
 
 /// What a job's process found out about the booth's cameras. Called by workers, several at a time.
@@ -43,8 +39,8 @@ using OnHealth = std::function<void(const std::string& capture, const std::vecto
 /// "…"}}. It ends with status 0 after the avatar's folder has appeared by a rename.
 class JobRunner {
  public:
-  JobRunner(JobRunnerOptions options, JobQueue& jobs, AvatarStore& avatars, EventBus& events, Metrics& metrics,
-            OnHealth on_health = {});
+  JobRunner(JobRunnerOptions options, JobQueue& jobs, HeadStart& head_start, AvatarStore& avatars, EventBus& events,
+            Metrics& metrics, OnHealth on_health = {});
   ~JobRunner();
 
   /// Has a worker that finds no job learn the background of this recording into the cache (COMMAND RECORDING --learn
@@ -70,6 +66,7 @@ class JobRunner {
 
   const JobRunnerOptions options_;
   JobQueue& jobs_;
+  HeadStart& head_start_;
   AvatarStore& avatars_;
   EventBus& events_;
   Metrics& metrics_;

@@ -3,7 +3,10 @@
 #include <algorithm>
 #include <chrono>
 #include <ctime>
+#include <functional>
+#include <future>
 #include <optional>
+#include <stop_token>
 
 #include "pipeline/export/avatar_files.h"
 #include "replay/durable_folder.h"
@@ -90,20 +93,22 @@ void append(std::vector<std::string>* to, const std::vector<std::string>& from) 
   to->insert(to->end(), from.begin(), from.end());
 }
 
-/// The decoded shots that the reconstruction needs; what could not be used is said in `warnings`.
-Result<CaptureFrames> load_capture(const Recording& recording, FaceMode face, const EmptyViewStore* kept,
-                                   const Work& work, std::vector<std::string>* warnings) {
+/// The empty booth and the subject of a recording, the rest of which may still be missing; what could not be used is
+/// said in `warnings`.
+Result<CaptureFrames> load_body(const Recording& recording, const EmptyViewStore* kept, const Work& work,
+                                std::vector<std::string>* warnings) {
   const Shot* body = recording.find(ShotRole::body);
   if (body == nullptr) return Error{ErrorCode::no_subject, "recording.json: shots has none with the role body"};
+  const Shot* background = recording.find(ShotRole::background);
+  if (background == nullptr)
+    return Error{ErrorCode::no_background, "recording.json: shots has none with the role background"};
   CaptureFrames capture;
   capture.rig = recording.rig;
-  if (const Shot* background = recording.find(ShotRole::background)) {
+  {
     const Step step(work, "load: empty booth");
     EmptyBooth learned = learn_background(recording, *background, kept, work);
     append(warnings, learned.faults);
     capture.background = std::move(learned.views);
-  } else {
-    return Error{ErrorCode::no_background, "recording.json: shots has none with the role background"};
   }
   LoadedShot loaded = load_shot(recording, *body, work);
   append(warnings, loaded.faults);
@@ -112,21 +117,82 @@ Result<CaptureFrames> load_capture(const Recording& recording, FaceMode face, co
     return Error{ErrorCode::too_few_views, "no image of the body shot can be used: " + reason};
   }
   capture.body = std::move(loaded.sets.front());
-  const Shot* scan = wants_scan(face) ? recording.find(ShotRole::gray_code) : nullptr;
-  if (scan != nullptr && scan->pattern) {
-    LoadedShot patterns = load_shot(recording, *scan, work);
-    append(warnings, patterns.faults);
-    capture.face = {*scan->pattern, std::move(patterns.sets)};
-  }
-  if (wants_scan(face)) {
-    auto file = find_scan_file(recording.folder);
-    if (!file)
-      warnings->push_back(file.error().message);
-    else if (*file)
-      capture.face_scan = std::move((*file)->mesh);
-  }
   return capture;
 }
+
+/// As soon as the recording has its body shot.
+Result<CaptureFrames> load_body_early(RecordingSource& source, const EmptyViewStore* kept, const Work& work,
+                                      std::vector<std::string>* warnings) {
+  if (!source.is_complete()) {
+    const auto part = source.with(ShotRole::body, work.stop);
+    if (!part) return part.error();
+    if (!source.is_complete()) {
+      std::vector<std::string> faults;
+      auto capture = load_body(*part, kept, work, &faults);
+      // Otherwise its files moved to their place meanwhile, unless they cannot be used there either.
+      if (capture && faults.empty()) return capture;
+    }
+  }
+  const auto recording = source.complete(work.stop);
+  if (!recording) return recording.error();
+  return load_body(*recording, kept, work, warnings);
+}
+
+/// The rest of a recording: waited for, and its face decoded, on a thread of its own beside the body's reconstruction.
+class RestOfRecording {
+ public:
+  struct Rest {
+    Recording recording;
+    FaceCapture face;
+    std::vector<std::string> warnings;
+  };
+
+  RestOfRecording(RecordingSource& source, FaceMode face, const std::function<void(const Recording&)>& on_complete,
+                  const Work& work)
+      : rest_(std::async(std::launch::async,
+                         [&source, face, on_complete, mark = work.mark, stop = stop_.get_token()] {
+                           return load(source, face, on_complete,
+                                       {.stop = stop, .progress = {}, .parallel = {}, .mark = mark});
+                         })),
+        asked_to_stop_(work.stop, [this] { stop_.request_stop(); }) {}
+  ~RestOfRecording() { stop_.request_stop(); }
+  RestOfRecording(const RestOfRecording&) = delete;
+  RestOfRecording& operator=(const RestOfRecording&) = delete;
+
+  /// Waits for it. @error what RecordingSource::complete returns
+  Result<Rest>& get() {
+    if (!got_) got_ = rest_.get();
+    return *got_;
+  }
+
+ private:
+  static Result<Rest> load(RecordingSource& source, FaceMode face,
+                           const std::function<void(const Recording&)>& on_complete, const Work& work) {
+    auto recording = source.complete(work.stop);
+    if (!recording) return recording.error();
+    if (on_complete) on_complete(*recording);
+    Rest rest{*std::move(recording), {}, {}};
+    if (!wants_scan(face)) return rest;
+    const Step step(work, "load: face");
+    const Shot* scan = rest.recording.find(ShotRole::gray_code);
+    if (scan != nullptr && scan->pattern) {
+      LoadedShot patterns = load_shot(rest.recording, *scan, work);
+      append(&rest.warnings, patterns.faults);
+      rest.face.patterns = {*scan->pattern, std::move(patterns.sets)};
+    }
+    auto file = find_scan_file(rest.recording.folder);
+    if (!file)
+      rest.warnings.push_back(file.error().message);
+    else if (*file)
+      rest.face.scan = std::move((*file)->mesh);
+    return rest;
+  }
+
+  std::stop_source stop_;
+  std::future<Result<Rest>> rest_;
+  std::optional<Result<Rest>> got_;
+  std::stop_callback<std::function<void()>> asked_to_stop_;
+};
 
 }  // namespace
 
@@ -140,11 +206,10 @@ const std::vector<std::string>& job_stages() {
   return stages;
 }
 
-Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_folder,
-                                        const std::filesystem::path& avatar, const ReconstructionOptions& options,
-                                        const FaceSources& sources, const AvatarFileOptions& files, const Work& work,
-                                        const JobProgress& progress, const HealthReport& health,
-                                        const EmptyViewStore* kept) {
+Result<JobReport> reconstruct_recording(RecordingSource& source, const std::filesystem::path& avatar,
+                                        const ReconstructionOptions& options, const JobSources& sources,
+                                        const AvatarFileOptions& files, const Work& work, const JobProgress& progress,
+                                        const HealthReport& health) {
   // A trailing slash names the same folder.
   const std::filesystem::path target = avatar.has_filename() ? avatar : avatar.parent_path();
   const std::filesystem::path parent = target.has_parent_path() ? target.parent_path() : ".";
@@ -155,27 +220,35 @@ Result<JobReport> reconstruct_recording(const std::filesystem::path& recording_f
 
   StageClock clock(progress);
   clock.tell("load", 0);
-  const auto recording = read_recording(recording_folder);
-  if (!recording) return recording.error();
   JobReport report;
   auto capture = [&] {
     const Step step(work, "load");
-    return load_capture(*recording, options.face, kept, work, &report.warnings);
+    return load_body_early(source, sources.kept, work, &report.warnings);
   }();
   if (work.stopped()) return Work::cancelled();
   if (!capture) return capture.error();
   clock.tell("load", 1);
 
+  RestOfRecording rest(source, options.face, sources.on_complete, work);
+  const auto face = [&]() -> Result<FaceCapture> {
+    auto& loaded = rest.get();
+    if (!loaded) return loaded.error();
+    return std::move(loaded->face);
+  };
   const auto stage_progress = [&](std::string_view stage, double fraction) { clock.tell(stage, fraction); };
-  auto made = reconstruct(*std::move(capture), options, sources, work, stage_progress, health);
+  auto made =
+      reconstruct(*std::move(capture), options, {sources.model, sources.detector, face}, work, stage_progress, health);
   if (!made) return made.error();
+  const auto& whole = rest.get();
+  if (!whole) return whole.error();
+  append(&report.warnings, whole->warnings);
   append(&report.warnings, made->warnings);
 
   AvatarMetadata metadata;
   metadata.id = target.filename().string();
   metadata.created = utc_now();
-  metadata.label = recording->label;
-  metadata.recording = recording->id;
+  metadata.label = whole->recording.label;
+  metadata.recording = whole->recording.id;
   metadata.cameras = std::move(made->cameras);
   metadata.face = to_string(made->face);
   metadata.texture_method = to_string(options.atlas.method);

@@ -70,13 +70,11 @@ struct SegmentedViews {
   std::vector<CameraHealth> health;  ///< in the order of the silhouettes
 };
 
-/// Develops a capture's raw frames where they are. @error invalid_argument  as develop
-Result<void> develop_all(CaptureFrames& capture, const Work& work) {
+/// Develops raw frames where they are. @error invalid_argument  as develop
+Result<void> develop_all(std::span<FrameSet> sets, const Work& work) {
   std::vector<Frame*> frames;
-  for (Frame& frame : capture.body.frames) frames.push_back(&frame);
-  if (capture.face)
-    for (FrameSet& set : capture.face->sets)
-      for (Frame& frame : set.frames) frames.push_back(&frame);
+  for (FrameSet& set : sets)
+    for (Frame& frame : set.frames) frames.push_back(&frame);
   std::vector<std::optional<Error>> faults(frames.size());
   work.parallel_for(frames.size(), 1, [&](size_t begin, size_t end) {
     for (size_t i = begin; i < end && !work.stopped(); ++i) {
@@ -205,8 +203,8 @@ std::vector<Frame> with_lit_face(std::span<const Frame> frames, const std::optio
 }
 
 /// The head about a face that was scanned, by shape and, where there is a detector, by sight.
-std::optional<HeadRegion> find_scanned_head(const CaptureFrames& capture, std::span<const Frame> frames,
-                                            const Mesh& surface, const FaceDetectorSource& source, const Work& work,
+std::optional<HeadRegion> find_scanned_head(const Rig& rig, std::span<const Frame> pictures, const Mesh& surface,
+                                            const FaceDetectorSource& source, const Work& work,
                                             std::vector<std::string>* warnings) {
   if (!source) return find_head(surface);
   const auto detector = source();
@@ -214,26 +212,26 @@ std::optional<HeadRegion> find_scanned_head(const CaptureFrames& capture, std::s
     warnings->push_back("the head was found by the body's shape alone: " + detector.error().message);
     return find_head(surface);
   }
-  return find_head(surface, capture.rig, with_lit_face(frames, capture.face), **detector, work);
+  return find_head(surface, rig, pictures, **detector, work);
 }
 
-Result<FaceSurface> scan_face(const CaptureFrames& capture, std::span<const Frame> frames,
+Result<FaceSurface> scan_face(const Rig& rig, const FaceCapture& capture, std::span<const Frame> frames,
                               std::span<const Silhouette> silhouettes, const Field& hull,
                               const ReconstructionOptions& options, const FaceDetectorSource& detector,
                               const Work& work, std::vector<std::string>* warnings) {
   const Mesh surface = extract_surface(hull, work);
-  const auto head = find_scanned_head(capture, frames, surface, detector, work, warnings);
+  const auto head = find_scanned_head(rig, with_lit_face(frames, capture.patterns), surface, detector, work, warnings);
   if (!head) return Error{ErrorCode::no_subject, "no head was found"};
-  if (capture.face_scan) {
-    const auto placed = place_external_scan(*capture.face_scan, surface, *head, work);
+  if (capture.scan) {
+    const auto placed = place_external_scan(*capture.scan, surface, *head, work);
     auto meshed = placed ? mesh_scan(placed->scan, {}, work) : placed.error();
     if (meshed) return FaceSurface{FaceMode::active, *head, std::move(*meshed), placed->eye, {}};
     const Error refused{meshed.error().code, "the scan in the face's file is not used: " + meshed.error().message};
-    if (!capture.face) return refused;
+    if (!capture.patterns) return refused;
     warnings->push_back(refused.message);
   }
   auto scanned =
-      scan_structured_light(capture.rig, *capture.face, silhouettes, head->box(), options.structured_light, work);
+      scan_structured_light(rig, *capture.patterns, silhouettes, head->box(), options.structured_light, work);
   if (!scanned) return scanned.error();
   warnings->insert(warnings->end(), scanned->warnings.begin(), scanned->warnings.end());
   auto meshed = mesh_scan(scanned->scan, {}, work);
@@ -268,14 +266,23 @@ Result<FaceSurface> fit_face(const VisualHull& hull, std::span<const Frame> fram
                      FittedFace{model->neutral, std::move(*fitted), std::move(patch)}};
 }
 
+/// What was recorded of the face, as far as that is of use.
+Result<FaceCapture> get_face_capture(FaceMode mode, const FaceCaptureSource& source, const Work& work) {
+  if (!wants_scan(mode) || !source) return FaceCapture{};
+  auto capture = source();
+  if (!capture || !capture->patterns) return capture;
+  if (const auto developed = develop_all(capture->patterns->sets, work); !developed) return developed.error();
+  return capture;
+}
+
 /// The face as asked for, or nothing and in the warnings why.
-std::optional<FaceSurface> make_face(const CaptureFrames& capture, const VisualHull& hull,
+std::optional<FaceSurface> make_face(const Rig& rig, const FaceCapture& capture, const VisualHull& hull,
                                      std::span<const Frame> frames, std::span<const Silhouette> silhouettes,
                                      const ReconstructionOptions& options, const FaceSources& sources, const Work& work,
                                      std::vector<std::string>* warnings) {
   if (options.face == FaceMode::none) return std::nullopt;
-  if (wants_scan(options.face) && (capture.face || capture.face_scan)) {
-    auto scanned = scan_face(capture, frames, silhouettes, hull.field, options, sources.detector, work, warnings);
+  if (capture.patterns || capture.scan) {
+    auto scanned = scan_face(rig, capture, frames, silhouettes, hull.field, options, sources.detector, work, warnings);
     if (scanned) return std::move(*scanned);
     const bool fits = options.face == FaceMode::automatic && sources.model;
     warnings->push_back((fits ? "the face was not scanned: " : "the face is the hull's own: ") +
@@ -426,7 +433,7 @@ Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOp
                                    const FaceSources& sources, const Work& work, const StageProgress& sink,
                                    const HealthReport& health) {
   const StageProgress progress = one_at_a_time(sink);
-  if (const auto developed = develop_all(capture, work); !developed) return developed.error();
+  if (const auto developed = develop_all({&capture.body, 1}, work); !developed) return developed.error();
   if (const auto checked = check(capture.rig); !checked) return checked.error();
   Reconstruction result;
   std::vector<std::string>& warnings = result.warnings;
@@ -464,9 +471,11 @@ Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOp
   std::optional<FaceSurface> face;
   {
     const StageReport report("face", work, progress);
-    face = make_face(capture, hull, frames, views.silhouettes, options, sources, report.work(), &warnings);
+    const auto recorded = get_face_capture(options.face, sources.capture, report.work());
+    if (!recorded) return recorded.error();
+    face =
+        make_face(capture.rig, *recorded, hull, frames, views.silhouettes, options, sources, report.work(), &warnings);
     hull.views.clear();
-    capture.face.reset();
     if (work.stopped()) return Work::cancelled();
   }
 

@@ -64,11 +64,19 @@ struct ReconstructionOptions {
 /// A capture, decoded. Its raw frames (Frame::mosaic) are developed first.
 struct CaptureFrames {
   Rig rig;
-  std::vector<EmptyView> background;         ///< the empty booth, by camera
-  FrameSet body;                             ///< the subject, one trigger
-  std::optional<GrayCodeCapture> face = {};  ///< the face under structured light, where it was taken
-  std::optional<Mesh> face_scan = {};        ///< another scanner's face, see place_external_scan; used before `face`
+  std::vector<EmptyView> background;  ///< the empty booth, by camera
+  FrameSet body;                      ///< the subject, one trigger
 };
+
+/// What was recorded of the subject's face alone.
+struct FaceCapture {
+  std::optional<GrayCodeCapture> patterns;  ///< the face under structured light; raw frames are developed
+  std::optional<Mesh> scan = {};            ///< another scanner's face, see place_external_scan; used before `patterns`
+};
+
+/// Gives it, and may wait for it: the face is taken and decoded while the body's shape is made. Asked at most once a
+/// reconstruction, when the body has its shape and the face is to be a scan if there is one.
+using FaceCaptureSource = std::function<Result<FaceCapture>()>;
 
 /// What the passive face needs besides a capture. It loads in a tenth of a second and serves any number of
 /// reconstructions.
@@ -85,10 +93,11 @@ using FaceModelSource = std::function<Result<FaceModel>()>;
 /// scan of a face.
 using FaceDetectorSource = std::function<Result<std::shared_ptr<const FaceDetector>>()>;
 
-/// What is loaded only when a face needs it.
+/// What is there only when a face needs it.
 struct FaceSources {
   FaceModelSource model;        ///< left out, there is no passive face
   FaceDetectorSource detector;  ///< left out, a scan is looked for where the hull's shape says that the head is
+  FaceCaptureSource capture;    ///< left out, nothing was recorded of the face alone
 };
 
 struct Reconstruction {
@@ -125,7 +134,7 @@ using HealthReport = std::function<void(const std::vector<CameraHealth>& cameras
 /// and with a warning; a face that cannot be had as asked for, or would be worse than the hull's, is the hull's, with a
 /// warning.
 ///
-/// @error what the stages return, cancelled
+/// @error what the stages and the source of the face's capture return, cancelled
 Result<Reconstruction> reconstruct(CaptureFrames capture, const ReconstructionOptions& options,
                                    const FaceSources& sources = {}, const Work& work = {},
                                    const StageProgress& progress = {}, const HealthReport& health = {});

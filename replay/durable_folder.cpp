@@ -194,6 +194,14 @@ Result<void> DurableFolder::write(const std::string& file, std::string_view text
   return write(file, bytes_of(text));
 }
 
+Result<void> DurableFolder::replace(const std::string& file, std::string_view text) {
+  const std::string fresh = file + ".new";
+  if (const auto written = write(fresh, text); !written) return written;
+  if (::rename((partial_ / fresh).c_str(), (partial_ / file).c_str()) != 0)
+    return write_error("cannot be replaced", partial_ / file, errno);
+  return {};
+}
+
 Result<void> DurableFolder::commit() {
   if (partial_.empty()) return Error{ErrorCode::invalid_state, final_.string() + ": is complete already"};
   if (const auto flushed = flush_tree(partial_); !flushed) return flushed;

@@ -44,6 +44,9 @@ class DurableFolder {
   Result<void> write(const std::string& file, std::span<const uint8_t> bytes);
   Result<void> write(const std::string& file, std::string_view text);
 
+  /// As write, in place of what may be there: who reads that file sees the old bytes or the new ones.
+  Result<void> replace(const std::string& file, std::string_view text);
+
   /// Flushes every file and folder and lets the folder appear at final_path(). Afterwards the object is done.
   /// An empty folder that is already there is replaced. After an error nothing has appeared.
   ///

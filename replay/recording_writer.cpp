@@ -85,6 +85,25 @@ struct RecordingWriter::Content {
       if (open.header.name == shot) open.frames.push_back(std::move(frame));
   }
 
+  /// Writes recording.json about the shots there are.
+  Result<void> describe() {
+    Recording recording;
+    recording.id = header.id;
+    recording.created = header.created;
+    recording.label = header.label;
+    recording.face = header.face;
+    for (const OpenShot& open : shots) {
+      // Frames came in any order; the file names them in one.
+      std::vector<FrameRecord> frames = open.frames;
+      std::sort(frames.begin(), frames.end(), [](const FrameRecord& a, const FrameRecord& b) {
+        return std::tie(a.index, a.camera) < std::tie(b.index, b.camera);
+      });
+      recording.shots.push_back(
+          {open.header.name, open.header.role, open.header.pattern, open.header.board, std::move(frames)});
+    }
+    return folder.replace("recording.json", write_recording_json(recording));
+  }
+
   DurableFolder folder;
   const RecordingHeader header;
   const Rig rig;
@@ -177,22 +196,13 @@ Result<void> RecordingWriter::add_shot(const Recording& from, const Shot& shot) 
   return {};
 }
 
+Result<fs::path> RecordingWriter::show_so_far() {
+  if (const auto written = content_->describe(); !written) return written.error();
+  return content_->folder.path();
+}
+
 Result<void> RecordingWriter::commit() {
-  Recording recording;
-  recording.id = content_->header.id;
-  recording.created = content_->header.created;
-  recording.label = content_->header.label;
-  recording.face = content_->header.face;
-  for (Content::OpenShot& open : content_->shots) {
-    // Frames came in any order; the file names them in one.
-    std::sort(open.frames.begin(), open.frames.end(), [](const FrameRecord& a, const FrameRecord& b) {
-      return std::tie(a.index, a.camera) < std::tie(b.index, b.camera);
-    });
-    recording.shots.push_back(
-        {open.header.name, open.header.role, open.header.pattern, open.header.board, std::move(open.frames)});
-  }
-  if (const auto written = content_->folder.write("recording.json", write_recording_json(recording)); !written)
-    return written;
+  if (const auto written = content_->describe(); !written) return written;
   const auto readable = read_recording(content_->folder.path());
   if (!readable) return Error{ErrorCode::internal, "the recording cannot be read again: " + readable.error().message};
   return content_->folder.commit();

@@ -70,6 +70,12 @@ class RecordingWriter {
   /// @error as begin_shot and add; invalid_file  an image is missing or not a regular file
   Result<void> add_shot(const Recording& from, const Shot& shot);
 
+  /// Makes what was added so far readable, as a recording in a folder that is not yet the recording's: for whoever can
+  /// begin with it.
+  /// @return that folder, which commit() or the writer's end takes away
+  /// @error disk_full, io
+  Result<std::filesystem::path> show_so_far();
+
   /// Writes recording.json and lets the recording appear. Afterwards the writer is done.
   /// @error as DurableFolder::commit
   Result<void> commit();

@@ -90,8 +90,8 @@ void run(benchmark::State& state, const Stage& stage) {
 void whole_job(Inputs& in) {
   const std::filesystem::path folder = std::filesystem::temp_directory_path() / "booth-benchmark";
   std::filesystem::remove_all(folder);
-  benchmark::DoNotOptimize(
-      must(reconstruct_recording(in.recording.folder, folder / "avatar", in.options, {}, {}, in.work)));
+  RecordingSource recording(in.recording.folder);
+  benchmark::DoNotOptimize(must(reconstruct_recording(recording, folder / "avatar", in.options, {}, {}, in.work)));
   std::filesystem::remove_all(folder);
 }
 

@@ -108,6 +108,7 @@ TEST(ParseConfig, TakesWhatIsSet) {
       keep_encoded = false
       [jobs]
       workers = 3
+      head_start = false
       [log]
       level = "debug"
       [replay]
@@ -139,6 +140,7 @@ TEST(ParseConfig, TakesWhatIsSet) {
   EXPECT_EQ(config.capture.images.format, SpoolOptions::Format::jpeg);
   EXPECT_FALSE(config.capture.images.keep_encoded);
   EXPECT_EQ(config.jobs.workers, 3);
+  EXPECT_FALSE(config.jobs.head_start);
   EXPECT_EQ(config.log.level, LogLevel::debug);
   EXPECT_EQ(config.replay.recording, "/etc/demo/man");
   EXPECT_EQ(config.replay.pace, ReplayOptions::Pace::fast);

@@ -17,9 +17,26 @@ case " $* " in
     exit 0
     ;;
 esac
+case " $* " in
+  *" --growing "*)
+    echo $$ >"$here/growing"
+    mkdir "$(dirname "$avatar")/.partial-$(basename "$avatar").2.1"
+    while read -r news; do
+      echo "$news" >>"$here/news"
+      case $news in
+        *complete*) break ;;
+        *)
+          [ "$(cat "$here/behaviour")" = die_early ] && kill -SEGV $$
+          ;;
+      esac
+    done
+    case $news in *complete*) ;; *) exit 1 ;; esac
+    rmdir "$(dirname "$avatar")/.partial-$(basename "$avatar").2.1"
+    ;;
+esac
 echo "$@" >>"$here/calls"
 case $(cat "$here/behaviour") in
-  good)
+  good | die_early)
     say '{"stage": "load", "fraction": 0.1}'
     say 'nonsense'
     say '{"stage": "hull", "fraction": 0.6}'

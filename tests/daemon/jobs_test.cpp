@@ -1,4 +1,5 @@
 #include <gmock/gmock.h>
+#include <signal.h>
 
 #include "daemon/job_queue.h"
 #include "tests/daemon/test_booth.h"
@@ -29,6 +30,76 @@ TEST_F(Jobs, WhatWasLearnedOfTheEmptyBoothIsPreparedBeforeTheFirst) {
                                         options_.config.booth.cache().string());
   EXPECT_EQ(reconstruct_.calls(), 0U);
   EXPECT_TRUE(wait_job(quick_capture(), "done"));
+}
+
+TEST_F(Jobs, OneBeginsWhileItsCaptureIsUnderWay) {
+  start();
+  const std::string id = capture({{"countdown_s", 0.5}});
+  ASSERT_TRUE(wait_until([&] { return !reconstruct_.news().empty(); }));
+  EXPECT_EQ(job(id)["state"], "not_found");
+  ASSERT_TRUE(wait_job(id, "done"));
+  EXPECT_EQ(reconstruct_.calls(), 1U);
+  const auto news = reconstruct_.news();
+  ASSERT_GE(news.size(), 2U);
+  EXPECT_THAT(Json::parse(news.front())["so_far"].get<std::string>(), HasSubstr(".partial-" + id));
+  EXPECT_EQ(Json::parse(news.back()), Json({{"complete", true}}));
+}
+
+TEST_F(Jobs, NoneBeginsEarlyWhereThatIsSwitchedOff) {
+  options_.config.jobs.head_start = false;
+  start();
+  ASSERT_TRUE(wait_job(quick_capture(), "done"));
+  EXPECT_EQ(reconstruct_.early(), 0);
+}
+
+TEST_F(Jobs, NoneBeginsEarlyWhileEveryWorkerHasAJob) {
+  start_with("hang");
+  const std::string first = quick_capture();
+  ASSERT_TRUE(wait_job(first, "running"));
+  ASSERT_TRUE(wait_until([&] { return reconstruct_.calls() == 1; }));
+  const size_t told = reconstruct_.news().size();
+  ASSERT_TRUE(wait_job(quick_capture(), "queued"));
+  EXPECT_EQ(reconstruct_.news().size(), told);
+}
+
+TEST_F(Jobs, OneThatBeganEarlyEndsWithACancelledCapture) {
+  start();
+  const std::string id = capture({{"countdown_s", 60}});
+  ASSERT_TRUE(wait_until([&] { return !reconstruct_.news().empty(); }));
+  const pid_t process = reconstruct_.early();
+  ASSERT_GT(process, 0);
+  call("capture.cancel", {{"capture", id}});
+  EXPECT_TRUE(wait_until([&] { return !session_busy(); }));
+  EXPECT_EQ(::kill(process, 0), -1);
+  EXPECT_TRUE(avatars_are_clean());
+  EXPECT_TRUE(wait_job(quick_capture(), "done"));
+}
+
+TEST_F(Jobs, OneThatBeganEarlyEndsWithADeletedCapture) {
+  start();
+  const std::string id = capture({{"countdown_s", 60}});
+  ASSERT_TRUE(wait_until([&] { return !reconstruct_.news().empty(); }));
+  call("capture.delete", {{"capture", id}});
+  EXPECT_TRUE(wait_until([&] { return traces(id).empty(); }));
+  EXPECT_EQ(::kill(reconstruct_.early(), 0), -1);
+}
+
+TEST_F(Jobs, OneWhoseEarlyProcessDiedIsDoneAllTheSame) {
+  start_with("die_early");
+  const std::string id = capture({{"countdown_s", 0.2}});
+  ASSERT_TRUE(wait_job(id, "done"));
+  EXPECT_GT(reconstruct_.early(), 0);
+  EXPECT_EQ(reconstruct_.calls(), 1U);
+  EXPECT_TRUE(wait_job(quick_capture(), "done"));
+}
+
+TEST_F(Jobs, TheBoothStopsWithACaptureWhoseJobBeganEarly) {
+  start();
+  capture({{"countdown_s", 60}});
+  ASSERT_TRUE(wait_until([&] { return !reconstruct_.news().empty(); }));
+  const pid_t process = reconstruct_.early();
+  stop();
+  EXPECT_EQ(::kill(process, 0), -1);
 }
 
 TEST_F(Jobs, AFailureIsTold) {

@@ -4,10 +4,16 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <array>
+#include <chrono>
 #include <filesystem>
 #include <fstream>
+#include <functional>
 #include <random>
 #include <set>
+#include <stop_token>
+#include <thread>
+#include <utility>
 
 #include "daemon/face_model_loader.h"
 #include "pipeline/export/metadata.h"
@@ -45,11 +51,12 @@ class ReconstructJob : public testing::Test {
   ~ReconstructJob() override { fs::remove_all(folder_); }
 
   Result<JobReport> run(const ReconstructionOptions& options = coarse(), const Work& extra = {},
-                        const FaceSources& sources = {}) {
+                        const JobSources& sources = {}) {
     Work work = pool_.work();
     work.stop = extra.stop;
+    RecordingSource recording(folder_ / "recording");
     return reconstruct_recording(
-        folder_ / "recording", folder_ / "out/avatar", options, sources, {}, work,
+        recording, folder_ / "out/avatar", options, sources, {}, work,
         [this](std::string_view stage, double fraction) { news_.emplace_back(stage, fraction); });
   }
   /// A face scan of which every image is the empty booth's: nothing is projected.
@@ -101,11 +108,110 @@ TEST_F(ReconstructJob, MakesTheSameAvatarOfABackgroundThatWasLearnedBefore) {
   const std::string model = text_of(avatar / "avatar.glb");
   const EmptyViewStore store(folder_ / "cache");
   for (int time = 0; time < 2; ++time) {
-    const auto report =
-        reconstruct_recording(folder_ / "recording", avatar, coarse(), {}, {}, pool_.work(), {}, {}, &store);
+    const auto report = run(coarse(), {}, {.kept = &store});
     ASSERT_TRUE(report.ok()) << report.error().message;
     EXPECT_EQ(text_of(avatar / "avatar.glb"), model);
   }
+}
+
+/// A recording that is still being written: its body is there, and the face comes later.
+class GrowingRecording : public ReconstructJob {
+ protected:
+  GrowingRecording() {
+    EXPECT_EQ(::pipe(news_pipe_.data()), 0);
+    fs::copy(folder_ / "recording", part_, fs::copy_options::recursive);
+  }
+  ~GrowingRecording() override {
+    hang_up();
+    ::close(news_pipe_[0]);
+  }
+  void tell(const std::string& line) const {
+    EXPECT_EQ(::write(news_pipe_[1], line.data(), line.size()), static_cast<ssize_t>(line.size()));
+  }
+  void show_part() const { tell(R"({"so_far": ")" + part_.string() + "\"}\n"); }
+  void complete() const { tell("{\"complete\": true}\n"); }
+  void hang_up() {
+    if (news_pipe_[1] >= 0) ::close(std::exchange(news_pipe_[1], -1));
+  }
+  /// @param on_stage  called with each stage that is told
+  Result<JobReport> follow(const std::function<void(std::string_view stage)>& on_stage = {},
+                           const std::stop_token& stop = {}) {
+    RecordingSource recording(folder_ / "recording", news_pipe_[0]);
+    Work work = pool_.work();
+    work.stop = stop;
+    return reconstruct_recording(recording, folder_ / "out/avatar", coarse(), {}, {}, work,
+                                 [&](std::string_view stage, double) {
+                                   if (on_stage) on_stage(stage);
+                                 });
+  }
+
+  const fs::path part_ = folder_ / "part";
+  std::array<int, 2> news_pipe_{};
+};
+
+TEST_F(GrowingRecording, BecomesTheSameAvatarThoughItsBodyIsCarvedBeforeItIsComplete) {
+  add_unlit_face_scan();
+  const auto expected = run();
+  ASSERT_TRUE(expected) << expected.error().message;
+  const std::string model = text_of(folder_ / "out/avatar/avatar.glb");
+  fs::remove_all(folder_ / "out");
+  fs::rename(folder_ / "recording", folder_ / "later");
+
+  show_part();
+  bool carved = false;
+  const auto report = follow([&](std::string_view stage) {
+    if (stage != "face" || std::exchange(carved, true)) return;
+    fs::rename(folder_ / "later", folder_ / "recording");
+    complete();
+  });
+  ASSERT_TRUE(report) << report.error().message;
+  EXPECT_TRUE(carved);
+  EXPECT_TRUE(text_of(folder_ / "out/avatar/avatar.glb") == model);
+  EXPECT_EQ(report->warnings, expected->warnings);
+}
+
+TEST_F(GrowingRecording, IsReadAtItsPlaceWhenThePartMovedAway) {
+  fs::remove_all(part_ / "frames");
+  show_part();
+  complete();
+  const auto report = follow();
+  ASSERT_TRUE(report) << report.error().message;
+  EXPECT_EQ(read_metadata(text_of(folder_ / "out/avatar/metadata.json"))->cameras.size(), 8U);
+  EXPECT_EQ(report->warnings, run()->warnings);
+}
+
+TEST_F(GrowingRecording, WaitsWhileThePartHasNoBody) {
+  tell("nonsense\n{\"so_far\": 7}\n{\"so_far\": \"/nowhere\"}\n");
+  std::jthread later([this] {
+    std::this_thread::sleep_for(std::chrono::milliseconds(100));
+    complete();
+  });
+  EXPECT_TRUE(follow());
+}
+
+TEST_F(GrowingRecording, ThatNeverBecomesCompleteLeavesNothing) {
+  for (const bool with_body : {true, false}) {
+    if (with_body) show_part();
+    hang_up();
+    const auto report = follow();
+    ASSERT_FALSE(report);
+    EXPECT_EQ(report.error().code, ErrorCode::invalid_state);
+    EXPECT_NE(report.error().message.find("was not completed"), std::string::npos);
+    EXPECT_TRUE(nothing_is_left());
+  }
+}
+
+TEST_F(GrowingRecording, CanBeGivenUpWhileItIsWaitedFor) {
+  show_part();
+  std::stop_source stop;
+  const auto report = follow(
+      [&](std::string_view stage) {
+        if (stage == "face") stop.request_stop();
+      },
+      stop.get_token());
+  ASSERT_FALSE(report);
+  EXPECT_EQ(report.error().code, ErrorCode::cancelled);
+  EXPECT_TRUE(nothing_is_left());
 }
 
 TEST_F(ReconstructJob, MakesTheAvatarWithoutAFaceScanThatIsTooPoor) {

@@ -59,6 +59,19 @@ class FakeReconstruct {
     for (std::string line; std::getline(file, line);) ++count;
     return count;
   }
+  /// What one that was started before its job was told so far, a line each.
+  std::vector<std::string> news() const {
+    std::ifstream file(folder_ / "news");
+    std::vector<std::string> lines;
+    for (std::string line; std::getline(file, line);) lines.push_back(line);
+    return lines;
+  }
+  /// The process that was last started before its job, or 0.
+  pid_t early() const {
+    std::ifstream file(folder_ / "growing");
+    pid_t process = 0;
+    return file >> process ? process : 0;
+  }
   /// The arguments with which it was last asked to learn a background, or none.
   std::string learned() const {
     std::ifstream file(folder_ / "learned");

@@ -28,7 +28,7 @@ namespace {
 
 constexpr std::array<uint8_t, 3> background{230, 230, 230};
 
-CaptureFrames load_capture(const std::filesystem::path& folder, const Work& work) {
+std::pair<CaptureFrames, FaceCapture> load_capture(const std::filesystem::path& folder, const Work& work) {
   const Recording recording = read_recording(folder).value();
   const auto sets_of = [&](ShotRole role) {
     const Shot* shot = recording.find(role);
@@ -39,8 +39,9 @@ CaptureFrames load_capture(const std::filesystem::path& folder, const Work& work
   capture.rig = recording.rig;
   capture.background = learn_empty_booth(sets_of(ShotRole::background), work).views;
   capture.body = sets_of(ShotRole::body).at(0);
-  capture.face = {recording.find(ShotRole::gray_code)->pattern.value(), sets_of(ShotRole::gray_code)};
-  return capture;
+  FaceCapture face;
+  face.patterns = {recording.find(ShotRole::gray_code)->pattern.value(), sets_of(ShotRole::gray_code)};
+  return {std::move(capture), std::move(face)};
 }
 
 FaceModel read_model(const std::string& landmarks) {
@@ -83,7 +84,7 @@ void run(const std::filesystem::path& recording, const std::string& landmarks, c
          const Window& window, const std::string& out) {
   ThreadPool pool;
   const Work work = pool.work();
-  const CaptureFrames capture = load_capture(recording, work);
+  const auto [capture, face] = load_capture(recording, work);
   const FaceModel model = read_model(landmarks);
   const RigCamera* view = capture.rig.find(camera);
   const auto photograph = std::find_if(capture.body.frames.begin(), capture.body.frames.end(),
@@ -94,7 +95,10 @@ void run(const std::filesystem::path& recording, const std::string& landmarks, c
   for (const FaceMode mode : {FaceMode::none, FaceMode::passive, FaceMode::active}) {
     ReconstructionOptions options;
     options.face = mode;
-    const auto made = reconstruct(capture, options, {[&] { return Result<FaceModel>(model); }, {}}, work);
+    const FaceSources sources{.model = [&] { return Result<FaceModel>(model); },
+                              .detector = {},
+                              .capture = [&scan = face] { return Result<FaceCapture>(scan); }};
+    const auto made = reconstruct(capture, options, sources, work);
     if (!made) throw std::runtime_error(made.error().message);
     if (made->face != mode) throw std::runtime_error("no face was made: " + std::string(to_string(mode)));
     const RayCaster caster(made->avatar.mesh);

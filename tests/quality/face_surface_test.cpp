@@ -101,7 +101,7 @@ class FaceSurface : public testing::TestWithParam<const char*> {
     folder_ = *folder;
     face_ = read_face_recording(folder_, pool_.work());
   }
-  Result<Reconstruction> made_with(GrayCodeCapture face, const FaceSources& sources = {}) {
+  Result<Reconstruction> made_with(GrayCodeCapture face, FaceSources sources = {}) {
     const Recording recording = read_recording(folder_).value();
     const Work work = pool_.work();
     CaptureFrames capture;
@@ -109,7 +109,7 @@ class FaceSurface : public testing::TestWithParam<const char*> {
     capture.background =
         learn_empty_booth(load_shot(recording, *recording.find(ShotRole::background), work).sets, work).views;
     capture.body = load_shot(recording, *recording.find(ShotRole::body), work).sets.at(0);
-    capture.face = std::move(face);
+    sources.capture = [&] { return Result<FaceCapture>({std::move(face)}); };
     ReconstructionOptions options;
     options.atlas.size = 512;  // the texture is not looked at
     return reconstruct(std::move(capture), options, sources, work);
@@ -163,11 +163,13 @@ TEST_P(FaceSurface, IsThePassiveOneWhereThePatternsAreSpoiltAndThereIsAModel) {
   const FaceModel model{std::move(predictor),
                         std::make_shared<const NeutralHead>(*parse_neutral_head(built_in_neutral_head()))};
   int asked = 0;
-  const auto made = made_with(without_patterns(), {[&] {
-                                                     ++asked;
-                                                     return Result<FaceModel>(model);
-                                                   },
-                                                   {}});
+  const auto made = made_with(without_patterns(), {.model =
+                                                       [&] {
+                                                         ++asked;
+                                                         return Result<FaceModel>(model);
+                                                       },
+                                                   .detector = {},
+                                                   .capture = {}});
   ASSERT_TRUE(made.ok()) << made.error().message;
   EXPECT_EQ(made->face, FaceMode::passive);
   EXPECT_EQ(asked, 1);

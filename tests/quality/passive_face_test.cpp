@@ -79,7 +79,7 @@ class PassiveFace : public testing::Test {
     if (change) change(capture);
     ReconstructionOptions options;
     options.face = face;
-    return reconstruct(std::move(capture), options, {[] { return Result<FaceModel>(model_); }, {}}, work);
+    return reconstruct(std::move(capture), options, {[] { return Result<FaceModel>(model_); }, {}, {}}, work);
   }
 
   inline static FaceModel model_;

@@ -4,6 +4,7 @@
 #include <gtest/gtest.h>
 
 #include <random>
+#include <set>
 #include <thread>
 
 #include "pipeline/image/codec.h"
@@ -223,6 +224,46 @@ TEST(RecordingWriter, LeavesNothingWithoutCommit) {
     ASSERT_TRUE(writer);
     ASSERT_TRUE((*writer)->begin_shot({.name = "body"}));
     ASSERT_TRUE((*writer)->add("body", noise_frame("left", 0)));
+  }
+  EXPECT_TRUE(fs::is_empty(scratch.path()));
+}
+
+TEST(RecordingWriter, ShowsWhatThereIsBeforeItIsComplete) {
+  const ScratchFolder scratch;
+  {
+    auto writer = RecordingWriter::begin(scratch.path(), header, small_rig());
+    ASSERT_TRUE(writer);
+    ASSERT_TRUE((*writer)->begin_shot({.name = "body"}));
+    ASSERT_TRUE((*writer)->add("body", noise_frame("left", 0)));
+    const auto folder = (*writer)->show_so_far();
+    ASSERT_TRUE(folder) << folder.error().message;
+    const auto part = read_recording(*folder);
+    ASSERT_TRUE(part) << part.error().message;
+    ASSERT_EQ(part->shots.size(), 1U);
+    const LoadedShot loaded = load_shot(*part, part->shots[0]);
+    ASSERT_EQ(loaded.sets.size(), 1U);
+    EXPECT_EQ(loaded.sets[0].frames[0].pixels->samples, noise_frame("left", 0).pixels->samples);
+    EXPECT_FALSE(fs::exists((*writer)->final_path()));
+
+    ASSERT_TRUE((*writer)->add("body", noise_frame("right", 0)));
+    ASSERT_TRUE((*writer)->show_so_far());
+    EXPECT_EQ(read_recording(*folder)->shots[0].frames.size(), 2U);
+    ASSERT_TRUE((*writer)->commit());
+    EXPECT_FALSE(fs::exists(*folder));
+  }
+  const auto whole = read_recording(scratch.path() / header.id);
+  ASSERT_TRUE(whole) << whole.error().message;
+  EXPECT_EQ(whole->shots[0].frames.size(), 2U);
+  std::set<std::string> files;
+  for (const auto& entry : fs::directory_iterator(whole->folder)) files.insert(entry.path().filename().string());
+  EXPECT_EQ(files, (std::set<std::string>{"frames", "recording.json", "rig.json"}));
+}
+
+TEST(RecordingWriter, WhatItShowedEndsWithIt) {
+  const ScratchFolder scratch;
+  {
+    auto writer = RecordingWriter::begin(scratch.path(), header, small_rig());
+    ASSERT_TRUE(writer && (*writer)->show_so_far());
   }
   EXPECT_TRUE(fs::is_empty(scratch.path()));
 }
