@@ -141,9 +141,10 @@ class Parts {
           visit(brick, (side - 1) * step, other, 0);
           continue;
         }
+        const int low = axis == 0 ? side : 1, high = axis == 2 ? side : side * side;  // strides along the face
         uint32_t last_node = none, last_other = none;
-        for (int sample = 0; sample < samples_per_brick; ++sample) {
-          if (along(sample, axis) != 0) continue;
+        for (int n = 0; n < side * side; ++n) {
+          const int sample = n % side * low + n / side * high;
           const int own = sample + (side - 1) * step;
           // Most samples of a face repeat what the one before them told.
           const uint32_t to = node(other, sample), from = node(brick, own);
