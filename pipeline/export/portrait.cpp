@@ -9,6 +9,7 @@
 #include <limits>
 #include <memory>
 #include <numbers>
+#include <span>
 #include <stdexcept>
 #include <type_traits>
 #include <vector>
@@ -304,11 +305,11 @@ Eigen::Array3f shade(const Picture& picture, const Fragment& fragment) {
   return picture.texture.sample(place) * (unshaded + (1 - unshaded) * light);
 }
 
-void render_rows(const Picture& picture, int first, int last, Image& image) {
+void render_rows(const Picture& picture, std::span<const uint32_t> triangles, int first, int last, Image& image) {
   const int samples = picture.samples_per_axis;
   Band band{first * samples, last * samples, picture.width * samples, {}};
   band.fragments.resize(static_cast<size_t>(band.bottom - band.top) * static_cast<size_t>(band.width));
-  for (uint32_t t = 0; t < picture.avatar.mesh.triangles.size(); ++t) rasterise(picture, t, band);
+  for (const uint32_t t : triangles) rasterise(picture, t, band);
   for (int y = first; y < last; ++y)
     for (int x = 0; x < picture.width; ++x) {
       Eigen::Array3f sum = Eigen::Array3f::Zero();
@@ -341,11 +342,32 @@ std::vector<Projected> project_vertices(const Mesh& mesh, const Viewer& viewer, 
   return projected;
 }
 
+/// For every band of so many rows of pixels the triangles that reach into it, in their order.
+std::vector<std::vector<uint32_t>> triangles_by_band(const Picture& picture, int rows) {
+  const float samples_a_band = static_cast<float>(rows * picture.samples_per_axis);
+  std::vector<std::vector<uint32_t>> bands(static_cast<size_t>((picture.height + rows - 1) / rows));
+  const auto last_band = static_cast<float>(bands.size() - 1);
+  const auto& triangles = picture.avatar.mesh.triangles;
+  for (uint32_t t = 0; t < triangles.size(); ++t) {
+    const auto& [a, b, c] = triangles[t];
+    const auto [top, bottom] = std::minmax({picture.vertices[a].y, picture.vertices[b].y, picture.vertices[c].y});
+    if (!(bottom >= 0)) continue;
+    const auto first = static_cast<size_t>(std::clamp(top / samples_a_band, 0.0F, last_band));
+    const auto last = static_cast<size_t>(std::min(bottom / samples_a_band, last_band));
+    for (size_t band = first; band <= last; ++band) bands[band].push_back(t);
+  }
+  return bands;
+}
+
 Image render(const Picture& picture, const Work& work) {
   Image image(picture.width, picture.height, 4);
-  constexpr size_t rows_a_band = 8;
-  work.parallel_for(static_cast<size_t>(picture.height), rows_a_band, [&](size_t begin, size_t end) {
-    render_rows(picture, static_cast<int>(begin), static_cast<int>(end), image);
+  constexpr int rows_a_band = 8;
+  const std::vector<std::vector<uint32_t>> bands = triangles_by_band(picture, rows_a_band);
+  work.parallel_for(bands.size(), 1, [&](size_t begin, size_t end) {
+    for (size_t band = begin; band < end; ++band) {
+      const int first = static_cast<int>(band) * rows_a_band;
+      render_rows(picture, bands[band], first, std::min(first + rows_a_band, picture.height), image);
+    }
   });
   return image;
 }
