@@ -6,6 +6,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "pipeline/types/vector_clones.h"
+
 namespace booth {
 namespace {
 
@@ -230,6 +232,7 @@ float PhotoConsistency::likeness(const std::vector<size_t>& seeing, const Eigen:
 
 /// The patch as a camera sees it, zero mean and unit length; false where it leaves the picture or the outline of the
 /// subject, or has no contrast. So small a patch is seen as through a parallel projection.
+BOOTH_VECTOR_CLONES
 bool PhotoConsistency::look_at(size_t view, const Eigen::Vector3f& middle, const Eigen::Vector3f& right,
                                const Eigen::Vector3f& up, Patch& patch) const {
   const auto place = [&](const Eigen::Vector3f& p) {
