@@ -91,17 +91,25 @@ std::vector<float> lightness_of(const Image& image, int step, int width, int hei
 std::vector<float> open_places(const Image& subject, int step, int width, int height) {
   std::vector<float> open(static_cast<size_t>(width) * static_cast<size_t>(height), 1.0F);
   if (subject.empty()) return open;
-  for (int y = 0; y < height * step; ++y)
-    for (int x = 0; x < width * step; ++x) {
-      if (subject.at(x, y) == 0) continue;
-      const int left = std::max(0, x / step - subject_margin), right = std::min(width - 1, x / step + subject_margin);
+  std::vector<uint8_t> covered(static_cast<size_t>(width));
+  for (int y = 0; y < height; ++y) {
+    std::fill(covered.begin(), covered.end(), uint8_t{0});
+    for (int dy = 0; dy < step; ++dy) {
+      const uint8_t* samples = subject.pixel(0, y * step + dy);
+      for (uint8_t& any : covered)
+        for (int dx = 0; dx < step; ++dx) any |= *samples++;
+    }
+    for (int x = 0; x < width; ++x) {
+      if (covered[static_cast<size_t>(x)] == 0) continue;
+      const int left = std::max(0, x - subject_margin), right = std::min(width - 1, x + subject_margin);
       // The margin above and below is left to the rows there.
-      for (int row = std::max(0, y / step - subject_margin); row <= std::min(height - 1, y / step + subject_margin);
+      for (int row = std::max(0, y - subject_margin); row <= std::min(height - 1, y + subject_margin);
            row += subject_margin) {
         float* at = open.data() + static_cast<size_t>(row) * static_cast<size_t>(width);
         std::fill(at + left, at + right + 1, 0.0F);
       }
     }
+  }
   return open;
 }
 
