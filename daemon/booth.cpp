@@ -8,7 +8,6 @@
 
 #include <algorithm>
 #include <cerrno>
-#include <ctime>
 #include <exception>
 #include <fstream>
 #include <future>
@@ -571,11 +570,10 @@ void Booth::sweep() const {
 std::optional<std::chrono::seconds> Booth::background_age() const {
   const auto background = backgrounds_->current();
   if (background == nullptr || background_is_played_) return std::nullopt;
-  std::tm utc{};
-  if (::strptime(background->created.c_str(), "%Y-%m-%dT%H:%M:%S", &utc) == nullptr) return std::nullopt;
-  const auto created = std::chrono::system_clock::from_time_t(::timegm(&utc));
+  const auto created = parse_iso8601(background->created);
+  if (!created) return std::nullopt;
   return std::max(std::chrono::seconds(0),
-                  std::chrono::floor<std::chrono::seconds>(std::chrono::system_clock::now() - created));
+                  std::chrono::floor<std::chrono::seconds>(std::chrono::system_clock::now() - *created));
 }
 
 /// A background that no longer fits is learned again while nobody is there; who could be is not learned by himself.

@@ -61,9 +61,9 @@ std::string written_at(const fs::path& file) {
 /// Gives a file the time that says since when its rig was in force. Where it cannot, the status is off, and nothing
 /// else.
 void set_written_at(const fs::path& file, const std::string& created) {
-  std::tm utc{};
-  if (::strptime(created.c_str(), "%Y-%m-%dT%H:%M:%S", &utc) == nullptr) return;
-  const timespec time{.tv_sec = ::timegm(&utc), .tv_nsec = 0};
+  const auto instant = parse_iso8601(created);
+  if (!instant) return;
+  const timespec time{.tv_sec = std::chrono::system_clock::to_time_t(*instant), .tv_nsec = 0};
   const std::array<timespec, 2> times{time, time};
   if (::utimensat(AT_FDCWD, file.c_str(), times.data(), 0) != 0)
     spdlog::warn("{}: {}", file.string(), std::generic_category().message(errno));

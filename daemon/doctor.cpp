@@ -5,7 +5,6 @@
 #include <sys/timex.h>
 
 #include <algorithm>
-#include <ctime>
 #include <fstream>
 #include <iterator>
 #include <optional>
@@ -13,6 +12,7 @@
 #include <utility>
 
 #include "daemon/api/curve_keys.h"
+#include "daemon/identifier.h"
 #include "replay/recording.h"
 
 namespace booth {
@@ -59,12 +59,6 @@ std::string in_mebibytes(uint64_t bytes) { return std::to_string(bytes / mebibyt
 
 std::string in_days(std::chrono::seconds age) {
   return std::to_string(std::chrono::duration_cast<std::chrono::hours>(age) / day) + " days";
-}
-
-std::optional<SystemClock::time_point> parse_utc(const std::string& text) {
-  std::tm utc{};
-  if (::strptime(text.c_str(), "%Y-%m-%dT%H:%M:%S", &utc) == nullptr) return std::nullopt;
-  return SystemClock::from_time_t(::timegm(&utc));
 }
 
 class Examination {
@@ -305,7 +299,8 @@ class Examination {
     for (const fs::path& folder : entries(at(config_.booth.backgrounds()))) {
       if (folder.filename().string().starts_with(".")) continue;
       if (const auto recording = read_recording(folder))
-        if (const auto created = parse_utc(recording->created)) newest = std::max(newest.value_or(*created), *created);
+        if (const auto created = parse_iso8601(recording->created))
+          newest = std::max(newest.value_or(*created), *created);
     }
     if (!newest)
       return warn("background", "the empty booth was never learned",

@@ -3,7 +3,6 @@
 #include <spdlog/spdlog.h>
 
 #include <algorithm>
-#include <ctime>
 #include <nlohmann/json.hpp>
 #include <utility>
 
@@ -61,10 +60,9 @@ std::optional<uint64_t> count(const Json& json, const char* name) {
 std::optional<std::chrono::sys_seconds> instant(const Json& json, const char* name) {
   const auto found = json.find(name);
   if (found == json.end() || !found->is_string()) return std::nullopt;
-  std::tm utc{};
-  const char* end = ::strptime(found->get_ref<const std::string&>().c_str(), "%Y-%m-%dT%H:%M:%SZ", &utc);
-  if (end == nullptr || *end != '\0') return std::nullopt;
-  return std::chrono::sys_seconds(std::chrono::seconds(::timegm(&utc)));
+  const auto time = parse_iso8601(found->get_ref<const std::string&>());
+  if (!time) return std::nullopt;
+  return std::chrono::floor<std::chrono::seconds>(*time);
 }
 
 /// `later` follows `sample`, which becomes both.

@@ -32,6 +32,17 @@ std::string iso8601(std::chrono::system_clock::time_point time, bool millisecond
   return result + "Z";
 }
 
+std::optional<std::chrono::system_clock::time_point> parse_iso8601(const std::string& text) {
+  std::tm utc{};
+  if (::strptime(text.c_str(), "%Y-%m-%dT%H:%M:%S", &utc) == nullptr) return std::nullopt;
+  using Clock = std::chrono::system_clock;
+  const std::chrono::seconds since_epoch(::timegm(&utc));
+  if (since_epoch > std::chrono::floor<std::chrono::seconds>(Clock::duration::max()) ||
+      since_epoch < std::chrono::ceil<std::chrono::seconds>(Clock::duration::min()))
+    return std::nullopt;
+  return Clock::time_point(since_epoch);
+}
+
 std::string make_capture_id(std::chrono::system_clock::time_point time) {
   std::string id = iso8601(time, true) + "-" + random_hex(4);
   std::replace(id.begin(), id.end(), ':', '-');

@@ -175,6 +175,11 @@ TEST_F(History, ASampleIsReadAsItWasWritten) {
     without.erase(name);
     EXPECT_FALSE(health_sample_from(without)) << name;
   }
+  for (const char* beyond_the_clock : {"6220-11-22T10:00:00Z", "0001-01-01T00:00:00Z", "tomorrow"}) {
+    Json strange = json;
+    strange["end"] = beyond_the_clock;
+    EXPECT_FALSE(health_sample_from(strange)) << beyond_the_clock;
+  }
 }
 
 class HistoryOfABooth : public TestBooth {};

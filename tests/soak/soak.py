@@ -141,7 +141,7 @@ def soak(booth, sessions, workers):
     retries = int(booth.call("system.metrics").get("shot_retries", 0))
     dropped = sum(camera["dropped"] for camera in booth.call("system.status")["cameras"])
 
-    warm = max(KEPT, sessions // 10)
+    warm = min(max(KEPT, sessions // 10), sessions - 1)
     span = max(3, sessions // 10)
     first, last = samples[warm:warm + span], samples[-span:]
     memory, descriptors, threads = ([statistics.median(s[i] for s in part) for part in (first, last)] for i in range(3))
